@@ -1,4 +1,4 @@
-"""Gradients of the op `rasterize`, and what torch.compile must know of the ops.
+"""Gradients of the op `rasterize`, and the fake ops that torch.compile needs.
 
 The op has one formula, `_keep` and `_backward`, which torch meets in two ways. It is registered with torch (2.4 and
 later), so that torch.compile sees through the op. Eager calls take it by an autograd.Function, which costs less a call.

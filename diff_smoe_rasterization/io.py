@@ -34,7 +34,7 @@ class Gaussians:
     # The mode that the model was trained with, under its name in files: see `settings.record_of`, `mode_of_record`.
     # None where the file does not say.
     blend_mode: Optional[str] = None
-    background_gate: Optional[float] = None  # lambda of `smoe` and `smoe_eq7`, likewise
+    background_gate: Optional[float] = None  # lambda of `smoe` and `smoe_eq7`, from the .ply's comments
     comments: Tuple[str, ...] = ()  # comment lines of the file, those that record mode and gate included
 
     @property

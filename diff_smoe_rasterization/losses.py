@@ -54,8 +54,8 @@ def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", tr
     """Mean structural similarity (Wang et al. 2004) of images in [0, 1]: 11x11 Gaussian window of sigma 1.5.
 
     img1, img2: [B, C, H, W] or [C, H, W]. padding: "same", windows reach into zeros outside the image; "valid", the
-    mean leaves out the 5 pixels at each side whose windows do. train: whether a gradient may be asked for, which img1
-    alone gets. The call is that of the package `fused_ssim`.
+    mean leaves out the 5 pixels at each side whose windows do. train: whether a gradient may be asked for; only img1
+    gets one. The call is that of the package `fused_ssim`.
     Raises ValueError or TypeError where arguments do not fit.
     """
     check_tensors("fused_ssim", img1=img1, img2=img2)
@@ -88,7 +88,7 @@ class _ImageLoss(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, dL_dloss: torch.Tensor) -> Tuple[Any, ...]:  # type: ignore[override]
-        if torch.is_grad_enabled():  # as it is with create_graph alone
+        if torch.is_grad_enabled():  # true only with create_graph
             raise RuntimeError("SSIM and the image loss: second derivatives are not implemented; leave out "
                                "create_graph=True")
         gradient, = ctx.saved_tensors

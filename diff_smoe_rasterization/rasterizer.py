@@ -24,7 +24,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
         settings: camera and options. Its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
             differentiable too, each on its own.
-        means2D: [N, 3], of which only the gradient is of use: dL/d(pixel) times (width / 2, height / 2), z = 0.
+        means2D: [N, 3]; only its gradient is used: dL/d(pixel) times (width / 2, height / 2), z = 0.
             Densification reads it.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.
         dc: [N, 1, 3], the first coefficient where shs [N, K - 1, 3] holds only the others.
@@ -32,7 +32,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         scales, rotations: [N, 3] standard deviations, world, and [N, 4] quaternions (w, x, y, z), used as given.
         cov3D_precomp: [N, 6] (xx, xy, xz, yy, yz, zz) instead of scales and rotations.
         outputs: names out of OUTPUTS, images to return beside the colour.
-        means2D_abs: [N, 2], of which only the gradient is of use: the sum over pixels of the absolute values of
+        means2D_abs: [N, 2]; only its gradient is used: the sum over pixels of the absolute values of
             dL/d(pixel), each axis apart, times (width / 2, height / 2). Without it nothing is summed.
     All tensors have one type, float32 or float64, and one device. Absent is None, or any tensor without elements;
     where N is 0, None or one of shape [0].

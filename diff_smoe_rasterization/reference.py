@@ -59,7 +59,7 @@ KERNEL_MIN = _float32(1e-5)  # other SMoE modes cut on G: faint pairs decide whe
 KERNEL_KEPT = _float32(math.exp(-4.5))  # G at 3 sigma: nearer, a background gate cuts nothing, or gradients would end
 TRANSMITTANCE_MIN = _float32(1e-4)  # a pixel this dark behind what it has is finished (3DGS)
 GATE_SUM_MIN = _float32(1e-30)  # under this, and only then, a sum of gates is none; far above float32's smallest number
-BLOCK = 32  # px; pixels are processed in squares of this side, for speed alone
+BLOCK = 32  # px; pixels are processed in squares of this side, only for speed
 
 
 class Gaussians(NamedTuple):
@@ -105,7 +105,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         settings: GaussianRasterizationSettings; viewmatrix, projmatrix, campos, bg and a tensor background_gate are
             differentiable.
         means2D: [N, 3]; its gradient is dL/d(pixel) times (0.5 width, 0.5 height), z = 0.
-        dc, shs: [N, 1, 3] and [N, K - 1, 3], or shs alone [N, K, 3]; K >= (sh_degree + 1)^2.
+        dc, shs: [N, 1, 3] and [N, K - 1, 3], or only shs [N, K, 3]; K >= (sh_degree + 1)^2.
         colors_precomp: [N, C] instead of dc and shs.
         scales, rotations: [N, 3] and [N, 4]; quaternions w, x, y, z are used as given.
         cov3D_precomp: [N, 6] xx, xy, xz, yy, yz, zz, instead of scales and rotations.
@@ -436,7 +436,7 @@ def near_pairs(splats, x, y, counts):
 
 
 def wide_pixels(splats, x, y, near, settings, mode):
-    """Returns which pixels are wide [pixels]: those whose near pairs alone have a gate sum below faint_below.
+    """Returns which pixels are wide [pixels]: those with a gate sum of the near pairs below faint_below.
 
     In the others no faint pair and no tail counts. There a pair of alpha < 1/255 would move its pixel by less than
     1/255/W, with W the gate sum. near: [n, pixels], of `near_pairs`.
@@ -516,7 +516,7 @@ def blend(alpha, color, depth, bg, mode, gate, tails):
     if isinstance(gate, torch.Tensor) or gate:
         background = background + gate * (1 - alpha).masked_fill(stopped, 1).prod(0)  # lambda T, behind the last pair
     # alpha (Eq. 3) divides by 1, which this sum is only to rounding; Eq. 7 (smoe, smoe_eq7), 8 (smoe_tn) and 6
-    # (smoe_std) differ in weight and gate_sum, and the background has a weight in the first two alone.
+    # (smoe_std) differ in weight and gate_sum, and the background has a weight only in the first two.
     total = torch.ones_like(gate_sum) if mode == "alpha" else gate_sum + background
 
     of_background = background * bg[:, None]
@@ -543,7 +543,7 @@ def _render_blocks(splats, settings, mode, gate):
         x = torch.arange(left, right).to(splats.depth).repeat(bottom - top)
         y = torch.arange(top, bottom).to(splats.depth).repeat_interleave(right - left)
         with torch.no_grad():
-            # The slack keeps rounding in this shortcut from losing a pair; `pair_counts` alone decides.
+            # The slack keeps rounding in this shortcut from losing a pair; only `pair_counts` decides.
             meets = footprint_meets(splats, left, top, right - 1, bottom - 1, settings, mode, slack=1.0)
             counts, wide = blended_pairs(_rows(splats, meets), x, y, settings, mode, gate)
         met = _rows(splats, meets)

@@ -190,7 +190,7 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
         given["output"] = arguments.output = given.pop("scene")
         del arguments.scene
     if "output" not in given or "scene" not in given and not arguments.resume:
-        arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs OUT alone")
+        arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs only OUT")
     if arguments.resume and arguments.scale_recipe and "scene" not in given:
         arguments.command_parser.error("--scale-recipe needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")

@@ -124,7 +124,7 @@ def _is_of(row: Dict[str, Any], config: TrainConfig) -> bool:
 
 
 def _gate_of(config: TrainConfig) -> Optional[float]:
-    """The gate that a run names; None where it was learned, which its .ply alone says."""
+    """The gate that a run names; None where it was learned: then only its .ply has it."""
     return None if config.background_gate == LEARNED else float(config.background_gate)
 
 

@@ -37,7 +37,7 @@ class GaussianModel:
         self.sh_degree = sh_degree
         self.active_sh_degree = 0
         self.stored = {name: raw[name].detach().clone().contiguous().requires_grad_() for name in PARAMETERS}
-        """The raw parameters, of which rows of spherical harmonics may wait for steps of `lazy`."""
+        """The raw parameters; some rows of spherical harmonics may wait for steps of `lazy`."""
         self.lazy: Optional[LazyAdam] = None
 
     @classmethod

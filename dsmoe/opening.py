@@ -1,4 +1,4 @@
-"""A trained model, by its run's folder or its .ply alone: how it is rendered, and where it can be looked at from."""
+"""A trained model, from its run's folder or from only its .ply: how to render it, and from which cameras."""
 from __future__ import annotations
 
 from dataclasses import dataclass

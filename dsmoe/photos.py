@@ -75,7 +75,7 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
         work = os.path.join(output, WORK)
         os.makedirs(work, exist_ok=True)
         write_record(output, SCENE, Record(subject, earlier.files), earlier.files)
-        pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # from now on it says errors alone
+        pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # from now on it prints only errors
         best = _placed(pycolmap, photos, names, work, matching, camera_model, progress, say)
         say("undistorting")
         pinhole = os.path.join(work, "undistorted")

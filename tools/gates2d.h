@@ -44,7 +44,7 @@ struct Mixture2d {
   std::vector<Kernel> kernels;
 };
 
-/// The picture, [3, H, W], and of each pixel the kernel of the greatest gate (of the greatest p G, likewise).
+/// The picture, [3, H, W], and per pixel the kernel with the greatest gate (or the greatest p G).
 struct Drawing {
   std::vector<float> color;
   std::vector<int32_t> greatest;  // [H, W]

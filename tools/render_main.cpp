@@ -50,7 +50,7 @@ Further options
   --view NAME|NUMBER  only this camera: its image name, or its place in the list or on the orbit, from 0
   --size WxH          of the pictures in pixels; only W keeps the shape. Default: as the cameras say; orbit 1280x720
   --blend NAME        alpha, smoe, smoe_eq7, smoe_tn or smoe_std. Default: as the model was trained, if its file says so
-  --background-gate X of smoe and smoe_eq7. Default: likewise, else 0
+  --background-gate X of smoe and smoe_eq7. Default: that of the .ply, else 0
   --background R,G,B  colour behind the Gaussians, 0 to 1. Default: 0,0,0
   --antialiasing      for models that were trained with it
   --device NAME       cpu or cuda. Default: cuda where this build has it, else cpu

@@ -85,7 +85,7 @@ std::vector<View> views_of(const io::ColmapModel& model, const std::string& fold
 std::vector<View> orbit_views(const Orbit& orbit) {
   constexpr double kPi = 3.14159265358979323846;
   if (!(dot(orbit.up, orbit.up) > 0)) throw std::invalid_argument("the up direction of an orbit must not be zero");
-  // The plane of the circle: two directions across `up`, of which any will do.
+  // The plane of the circle: any two directions across `up`.
   const Vector up = unit(orbit.up);
   const Vector helper = std::abs(up[2]) < 0.9 ? Vector{0, 0, 1} : Vector{1, 0, 0};
   const Vector ahead = unit(cross(cross(up, helper), up)), aside = cross(up, ahead);

@@ -2,7 +2,7 @@
 
     torchrun --nproc-per-node 2 benchmarks/timing/distributed.py --npz PACKED.npz --batch 4 --json ROWS.jsonl
 
-One process without torchrun does the same alone. The model is one that `models.from_npz` reads, or --copies of it,
+One process without torchrun takes the same steps. The model is one that `models.from_npz` reads, or --copies of it,
 each moved by noise and made smaller, so that all together cover what one did. Targets are renderings of the model, but
 lighter. The first process prints and writes a row: images a second and peak memory of each process. With --digest it
 has checksums of the gradients, which with --deterministic are the same for any number of processes.
@@ -48,7 +48,7 @@ def rows_of(packed: Dict[str, torch.Tensor], copies: int, begin: int, end: int) 
 
 
 def new_trainer(options: argparse.Namespace, group: Any) -> BatchTrainer:
-    """A trainer of the model with all SH degrees active, whose Gaussians stay as many as they are."""
+    """A trainer of the model with all SH degrees active and a fixed number of Gaussians."""
     packed = np.load(options.npz)
     cameras = models.from_npz_cameras(packed)
     cameras = [camera.resized(options.width or camera.width, options.height or camera.height) for camera in cameras]

@@ -36,7 +36,7 @@ _VALUE = 1 + _FEATURES  # within the list's seen part?; g'.c
 _MOMENTS = 1 + 3  # dL/dpower; sums of it times 1, dy, dy^2
 _BACKWARD_REST = _VALUE + _FEATURES + _MOMENTS
 BACKWARD = {mode: gate + _BACKWARD_REST + (1 if mode == "smoe_std" else _TRANSMIT_BACKWARD)
-            for mode, gate in _GATE.items()}  # smoe_std: u alone
+            for mode, gate in _GATE.items()}  # smoe_std: only u
 
 
 def multiply_adds_per_second(threads: int, size: int = 1024, repeats: int = 12) -> float:

@@ -47,7 +47,7 @@ def time_frames(renderer: Ours, view, repeats: int) -> Dict[str, float]:
     times = {}
     for backward in (False, True):
         for fits in (False, True):
-            view = view._replace(image_height=view.image_height - 1)  # a size of which nothing has been learned
+            view = view._replace(image_height=view.image_height - 1)  # a size that no rendering has had
             frame = frame_of(renderer, view, backward)
             if not fits:
                 with torch.no_grad():
@@ -94,7 +94,7 @@ class CountedRasterize:
 
 
 class CountedOps:
-    """The ops, of which `rasterize` is counted."""
+    """The ops; calls of `rasterize` are counted."""
 
     def __init__(self, missing: List[torch.Tensor]) -> None:
         self._ops = torch.ops.diff_smoe_rasterization
@@ -109,7 +109,7 @@ def count_in_training(words: List[str]) -> int:
     autograd._OPS = direct._OPS = CountedOps(missing)
     status = dsmoe(["train", *words])
     without_room = torch.stack(missing).nonzero().squeeze(1).tolist() if missing else []
-    print(f"{len(missing)} renderings, of which {len(without_room)} had no room for their lists: "
+    print(f"{len(missing)} renderings; the lists of {len(without_room)} did not fit their memory: "
           f"{', '.join(map(str, without_room)) or 'none'}")
     return status
 

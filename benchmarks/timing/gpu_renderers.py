@@ -1,6 +1,6 @@
 """The rasterizers that gpu_rasterizer.py times: how each is called. Nothing of a peer's is here but its interface.
 
-A peer is imported from the folder of its name below --peers-path, by the process that measures it alone: several of
+A peer is imported from the folder of its name below --peers-path, by the process that measures only it: several of
 them share one module name. What all get: activated float32 parameters (raw ones where a peer's interface takes raw
 ones), the same cameras, a black background and the near plane of 3DGS, 0.2.
 """
@@ -171,7 +171,7 @@ class FasterGS(Renderer):
 
 class FasterGSInference(FasterGS):
     has_backward = False
-    note = "its path for rendering alone; takes raw parameters"
+    note = "its path for rendering only; takes raw parameters"
 
     def render(self, view):
         p = self.parameters

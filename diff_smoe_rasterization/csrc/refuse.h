@@ -255,7 +255,7 @@ void refuse_contributions(const char* function, const Frame& frame, const Contri
   refuse_null(function, "sums.distances", map.sums.distances, "[N]", count);
 }
 
-// A mode of which no removal is known.
+// A mode without a removal cost.
 template <class Modes = BlendModes> void refuse_unremovable(const char* function, BlendMode mode) {
   Modes::for_each([&](auto of) {
     constexpr BlendMode kMode = decltype(of)::value;

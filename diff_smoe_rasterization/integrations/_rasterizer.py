@@ -32,7 +32,7 @@ def settings_with(names: Sequence[str], module: str) -> type:
     """Returns the package's settings as a class that has the fields `names` behind `debug`.
 
     A field that the package has too moves there with its default; another one has the default None.
-    module: the name of the module whose class it is, by which pickle finds it.
+    module: the module that the class belongs to; pickle finds it by this name.
     """
     fields = [field for field in Settings._fields if field not in names]
     fields[fields.index("debug") + 1:fields.index("debug") + 1] = names
@@ -150,7 +150,7 @@ Renderer = Callable[[Settings, Dict[str, Any]], Tuple[torch.Tensor, ...]]
 def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) -> Tuple[type, type, Any]:
     """Returns GaussianRasterizationSettings, GaussianRasterizer and rasterize_gaussians of a contract.
 
-    module: the name of the module whose they are. renderer: from the settings and the arguments by name to the results,
+    module: the module that the classes belong to. renderer: from the settings and the arguments by name to the results,
     where `results_of` does not do.
     """
     entry = contract_of(contract)

@@ -55,7 +55,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         packed: meta is that of gsplat's packed mode. What is computed, and its memory, is the same.
         absgrad: means2d also gets the attribute `absgrad`: the sum over pixels of its absolute gradients.
         backgrounds: [C, D]; None is black. The background of a depth is 0.
-        render_mode: "RGB", and ED for the depth sum(w z) / sum(w) or D for that times alphas, alone or as the last
+        render_mode: "RGB", and ED for the depth sum(w z) / sum(w) or D for that times alphas, as the only or the last
             channel.
         rasterize_mode: "classic" or "antialiased".
         covars: [N, 3, 3] in place of quats and scales, which are then ignored.
@@ -203,7 +203,7 @@ def compute_relocation(opacities: torch.Tensor, scales: torch.Tensor, ratios: to
     """Opacities [N] and scales [N, 3] of Gaussians that n equal ones in one place take over (Eq. 9 of 3DGS-MCMC).
 
     opacities: [N]. scales: [N, 3]. ratios: [N] n, which is clamped in place to [1, n_max], as gsplat does. binoms:
-    [n_max, n_max], of which only the size is read. min_opacity: what new opacities are at least.
+    [n_max, n_max]; only its size is read. min_opacity: the smallest new opacity.
     """
     ratios.clamp_(min=1, max=len(binoms))
     new_opacities, factors = divided(opacities, ratios, min_opacity)
@@ -230,7 +230,7 @@ def quat_scale_to_covar_preci(quats: torch.Tensor, scales: torch.Tensor, compute
 def _refuse_what_is_not_offered(others, **arguments):
     for name, (value, only) in arguments.items():
         if value != only:
-            raise NotImplementedError(f"rasterization: {name} is {value!r}; this module offers {only!r} alone")
+            raise NotImplementedError(f"rasterization: {name} is {value!r}; this module offers only {only!r}")
     for name, value in others.items():
         if name not in OF_LATER_VERSIONS:
             raise TypeError(f"rasterization: there is no argument {name}")

@@ -85,4 +85,4 @@ class GaussianRasterizer(_Rasterizer):
     def integrate(self, *_: Any, **__: Any) -> NoReturn:
         """Refuses."""
         raise NotImplementedError("GaussianRasterizer.integrate: this package does not integrate Gaussians over points "
-                                  "(mesh_extract_tetrahedra.py); mesh_extract.py needs depths alone")
+                                  "(mesh_extract_tetrahedra.py); mesh_extract.py needs only depths")

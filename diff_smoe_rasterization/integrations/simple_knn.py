@@ -1,4 +1,4 @@
-"""The API of simple_knn, of both kinds: distCUDA2 gives distances alone, or also which the neighbours are.
+"""The API of simple_knn, of both kinds: distCUDA2 gives distances, and on request the neighbours' indices.
 
 FSGS and its forks have the second kind. A call's file says which it is written for: there a result is unpacked.
 """

@@ -18,7 +18,7 @@ def scatter(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Optional
     """
     if out is not None or reduce not in ("sum", "add"):
         raise NotImplementedError(f"scatter: reduce is {reduce!r}, out is {'None' if out is None else 'given'}; this "
-                                  "module offers sums into a new tensor alone")
+                                  "module offers only sums into a new tensor")
     index, shape = _fitted("scatter", src, index, dim, dim_size)
     return src.new_zeros(shape).scatter_add_(dim, index, src)
 
@@ -32,7 +32,7 @@ def scatter_max(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Opti
     Raises NotImplementedError where `out` is given.
     """
     if out is not None:
-        raise NotImplementedError("scatter_max: out is given; this module offers maxima in a new tensor alone")
+        raise NotImplementedError("scatter_max: out is given; this module offers only maxima in a new tensor")
     index, shape = _fitted("scatter_max", src, index, dim, dim_size)
     size = src.shape[dim]
     values = src.detach()

@@ -2,7 +2,7 @@
 
     python -m dsmoe.bench.cell CELL.json OUT [--gpus 0,1 --per-device 2 --locks FOLDER]
 
-OUT/row.json is written in any case but one: where this command itself is killed, and is to be started again. The work
+OUT/row.json is always written, unless this command itself is killed and has to be started again. The work
 is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the reason.
 OUT/log.txt is what it printed.
 """
@@ -147,7 +147,7 @@ def how_it_ended(status: int, log_path: str) -> str:
 def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Tuple[str, IO[str]]:
     """Waits for a GPU that fewer than per_gpu cells of these locks have: one that none has, where there is one.
 
-    Returns its name, and the lock, which is to be kept open. Snakemake counts GPUs, and does not say which is free.
+    Returns its name and the lock, which must stay open. Snakemake counts GPUs, but does not say which is free.
     """
     import fcntl
 

@@ -182,7 +182,7 @@ def _method(method: Values, where: str, protocol: Values, folder: str) -> Values
            + ("unpatched, patched or fused" if can_be_patched else "unpatched only"))
     if variant == "unpatched":
         refuse(axes.setdefault("blend_modes", ["alpha"]) != ["alpha"],
-               f"{where}.blend_modes: an unpatched checkout has its own blending alone, which is `alpha`")
+               f"{where}.blend_modes: an unpatched checkout has only its own blending, `alpha`")
     refuse(name in NEEDS and NEEDS[name] not in arguments,
            f"{where}.arguments: {name} needs {NEEDS.get(name)} N in place of a threshold")
     if "budget" in given:
@@ -220,10 +220,10 @@ def _can_follow(protocol: Values, name: str, where: str) -> None:
            f"protocol.principal_point: is 'scene', but the loader of {name} ({where}) moves it to the image centre; it "
            "must be 'centre', or the figures would not be comparable")
     refuse(protocol["device"] != "cuda",
-           f"protocol.device: is {protocol['device']!r}, but {name} ({where}) trains on CUDA alone")
+           f"protocol.device: is {protocol['device']!r}, but {name} ({where}) trains only on CUDA")
     refuse(protocol["options"].get("sh_degree_interval", 1000) != 1000 or protocol["scale_recipe"],
            f"protocol: {name} ({where}) raises the SH degree every 1000 steps, whatever the recipe: scale_recipe and "
-           "options.sh_degree_interval are for the native trainer alone")
+           "options.sh_degree_interval are only for the native trainer")
     for option, value in protocol["options"].items():
         refuse(option in (*LACKS[name], *OF_NATIVE_ALONE) and value is not False,
                f"protocol.options.{option}: {name} ({where}) has no such option, or means something else by it: its "
@@ -239,8 +239,8 @@ def _can_train(scene: Values, method: Values, axes: Axes) -> None:
     refuse(scene["init_points"],
            f"{what}: init_points is {scene['init_points']}, but checkouts start from all points")
     refuse(LEARNED in axes["background_gates"] and method["variant"] != "unpatched",
-           f"{what}: background_gates: {LEARNED!r} is for the native trainer alone; it must be a number")
-    refuse(axes["budgets"] != [0], f"{what}: budgets: are for the native trainer alone; leave them out")
+           f"{what}: background_gates: {LEARNED!r} is only for the native trainer; it must be a number")
+    refuse(axes["budgets"] != [0], f"{what}: budgets: are only for the native trainer; leave them out")
     refuse(name in COUNTED_BY and len(thresholds) > 1,
            f"{what}: {name} has no threshold ({COUNTED_BY.get(name)} stands for it): {len(thresholds)} of them would "
            "be the same training over again; give the method densify_grad_thresholds of one value, which names its "

@@ -73,7 +73,7 @@ def read_object(path: str, model: Type[Any] = dict) -> Optional[Dict[str, Any]]:
 
 
 def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
-    """The object that a text in json is, of which all that is read has its type. Raises ReportError, which names the
+    """Parses a json object and checks the types of the fields that are read. Raises ReportError, which names the
     place of the text."""
     return _typed(_object(text, place), place, model)
 
@@ -144,7 +144,7 @@ def packed(rows: Sequence[Row]) -> str:
 
 
 def _common(objects: Sequence[Row]) -> Row:
-    """Of each field that all objects have the commonest value; of objects in objects likewise."""
+    """The most common value of each field that all objects have; nested objects are treated the same way."""
     found: Row = {}
     for name in (name for name in objects[0] if all(name in entry for entry in objects)):
         values = [entry[name] for entry in objects]

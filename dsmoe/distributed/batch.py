@@ -2,7 +2,7 @@
 
 Every process projects its own Gaussians for all views and sends what a view sees to the process that blends it. The
 gradients by those footprints come back, and each process makes of them the gradients of its own Gaussians. A process
-that is alone does the same without sending.
+by itself does the same without sending.
 """
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Batch:
         self._values = model.activated()
         opacities, scales, rotations = self._values
         arguments = {**model.color_arguments(), "scales": scales, "rotations": rotations,
-                     "means2D": model.raw["means3D"]}  # of which only the gradient is of use
+                     "means2D": model.raw["means3D"]}  # only its gradient is used
         self.projected: List[Projected] = []
         packed: List[torch.Tensor] = []
         for each in settings:

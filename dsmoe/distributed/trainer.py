@@ -39,7 +39,7 @@ class BatchTrainer(Trainer):
 
     @property
     def checkpoint_device(self) -> str:
-        return "cpu"  # of which each process takes its part
+        return "cpu"  # each process then takes its own part
 
     @property
     def num_gaussians(self) -> int:

@@ -137,7 +137,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         chosen = None
     elif callers and GR not in callers and known:
         reason = (f"{GR} {'does not import' if GR in now else 'is not there to import'} the rasterizer, but "
-                  f"{', '.join(callers[:3])}, and a patch is of {GR} alone: {_by_run(before)}")
+                  f"{', '.join(callers[:3])}, and a patch is only of {GR}: {_by_run(before)}")
         chosen = None
     elif GR not in now:
         reason, chosen = f"there is no {GR} in it", None

@@ -248,7 +248,7 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     returned, perhaps = sorted(those(facts, "returns ")), sorted(those(facts, "may return "))
     if those(facts, "renamed ") and not returned + perhaps:
         return None, (f"it imports {', '.join(sorted(those(facts, 'renamed ')))}, and what a call returns is not seen: "
-                      f"if that is the API of a rasterizer that is known here, --trainer says of which; {OF_ALL}")
+                      f"if it has the API of a rasterizer that is known here, name that one by --trainer; {OF_ALL}")
     longest = sorted(perhaps, key=lambda found: -found.count(",")) or [""]  # the most that code takes
     for kept, contract in itertools.product(longest, fitting):
         if all(_fits(found, contract) for found in returned) and (not kept or _fits(kept, contract)):
@@ -321,7 +321,7 @@ def of_one_name(root: Path) -> List[str]:
     """Says which rasterizers of one name a checkout brings, such as one for each kind of lens."""
     own = sorted(path.parent.name for path in root.glob(f"submodules/*/{RASTERIZER}"))
     return [f"the checkout has {', '.join(own)}, all called {RASTERIZER}: this package's takes the place of each, and "
-            "renders pinhole cameras alone"] if len(own) > 1 else []
+            "renders only pinhole cameras"] if len(own) > 1 else []
 
 
 def is_for_sparse_adam(root: Path, files: Mapping[str, bytes], facts: Set[str]) -> bool:

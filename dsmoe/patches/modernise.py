@@ -55,7 +55,7 @@ def unique_rows(unique: Any, input: Any, sorted: bool = True, return_inverse: bo
     inverse = torch.zeros(len(input), dtype=torch.int64, device=input.device)
     for column in input.reshape(len(input), -1).unbind(1):
         values, rank = unique(column, return_inverse=True)
-        # Of the columns so far and this one. Both are ranks below N: no key reaches N^2, of which int64 takes N < 3e9.
+        # Of the columns so far and this one. Both are ranks below N: no key reaches N^2, which fits int64 for N < 3e9.
         _, inverse, counts = unique(inverse * len(values) + rank, return_inverse=True, return_counts=True)
     rows = input.new_empty(len(counts), *input.shape[1:])
     rows[inverse] = input  # of rows that are equal any one

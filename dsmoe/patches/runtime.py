@@ -33,7 +33,7 @@ USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used firs
 
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate: that of the mode."""
-    _check_renderer()  # where it alone was restored, the option would be recorded and ignored
+    _check_renderer()  # where only it was restored, the option would be recorded and ignored
     return resolve_blend_mode(None), ""
 
 
@@ -80,7 +80,7 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
 
     Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args; there `smoe` is
     `smoe_tails`. Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a
-    `background_gate`: 0. `smoe` in the cfg_args of an earlier version is `smoe_eq7`, also where it is typed besides:
+    `background_gate`: 0. `smoe` in the cfg_args of an earlier version is `smoe_eq7`, even if `smoe` is also typed:
     where `dataset` has a trained model's options, so its gate is no text, and under `of_saved`.
     From then on a rendering of this process whose settings name no mode has both.
     Says on stderr what they are. Warns, once, where one may not be what was meant.
@@ -185,7 +185,7 @@ def gsplat_of_run() -> None:
     """Puts this package's functions into gsplat as it is installed: the rasterizer, and what its strategies compute.
 
     The strategies and all else stay gsplat's own. A gsplat before 1.5 finds radii [C, N], without an axis of two.
-    Where gsplat cannot be had, the package has `rasterization` and `rendering.rasterization` alone.
+    Where gsplat cannot be had, the package has only `rasterization` and `rendering.rasterization`.
     """
     from diff_smoe_rasterization.integrations import gsplat as ours
     if not is_installed("gsplat"):

@@ -16,7 +16,7 @@ from .metrics import image_metrics
 from .rendering import Renderer
 
 WARM_UP_VIEWS = 2  # rendered untimed before the first timed one
-PASSES = 5  # over all views, of which each view's time is the median; a view of milliseconds is easily disturbed
+PASSES = 5  # over all views; a view's time is the median, since other programs easily disturb milliseconds
 SECONDS = 2.0  # of rendering, behind which no further pass begins
 Measure = Callable[..., Mapping[str, Optional[float]]]
 METRICS = ("psnr", "ssim", "psnr_float")  # what image_metrics gives
@@ -33,7 +33,7 @@ class Evaluation:
 
 def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: bool = False,
              measure: Measure = image_metrics, passes: int = PASSES) -> Evaluation:
-    """Renders every view; times rendering alone, synchronised, without loading, metrics or disk.
+    """Renders every view; times only the rendering, synchronised, without loading, metrics or disk.
 
     measure: from a rendering and its ground truth, [3, H, W], and its view's mask, [1, H, W] or None, to metrics by
     name. passes: how often the views are rendered, as long as that takes less than SECONDS in all; the time of a view

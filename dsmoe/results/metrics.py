@@ -27,7 +27,7 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor]
 def masked_ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> float:
     """SSIM of two images [3, H, W], both times the mask [1, H, W], averaged over the pixels as the mask counts them.
 
-    Window, constants and padding are those of `fused_ssim`, which gives the plain mean alone.
+    Window, constants and padding are those of `fused_ssim`, which gives only the plain mean.
     """
     offsets = torch.arange(11, device=image.device) - 5.0
     line = torch.exp(-offsets**2 / (2 * 1.5**2)).double()

@@ -57,7 +57,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         "background_gate": config.background_gate if background_gate is None else background_gate,
         **evaluation.metrics,
         "num_gaussians": num_gaussians,
-        "train_seconds": train_seconds,  # the loop alone: without loading, evaluation and checkpoints
+        "train_seconds": train_seconds,  # only the loop: without loading, evaluation and checkpoints
         "fps": evaluation.fps,
         "protocol": {
             "scene_kind": scene.kind,

@@ -12,12 +12,12 @@ from ..errors import SceneError
 from .cameras import LARGEST, Camera
 
 FIELD_OF_VIEW = 0.9  # radians, of a camera that no scene gives
-SIZE = (800, 600)  # pixels, likewise
+SIZE = (800, 600)  # pixels of such a camera
 
 
 @dataclass(frozen=True)
 class Orbit:
-    """A ring of camera positions about a point, all of which look at it."""
+    """A ring of cameras around a point; all look at the point."""
 
     target: np.ndarray  # [3] world
     up: np.ndarray  # [3] unit, world

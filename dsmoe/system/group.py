@@ -20,7 +20,7 @@ TIMEOUT = datetime.timedelta(hours=2)
 
 
 class Group:
-    """Process `rank` of `size`. Every method is called by all processes, in the same order. This one is alone."""
+    """Process `rank` of `size`. Every method is called by all processes, in the same order. Here: one process."""
 
     rank = 0
     size = 1
@@ -35,7 +35,7 @@ class Group:
         return [list(numbers)]
 
     def exchange(self, rows: torch.Tensor, sent: Sequence[int], received: Sequence[int]) -> torch.Tensor:
-        """Sends rows [sum(sent), ...] to the processes in their order; returns theirs [sum(received), ...] likewise."""
+        """Sends rows [sum(sent), ...] to the processes in rank order; returns the rows received, in the same order."""
         return rows
 
     def all_rows(self, rows: torch.Tensor, counts: Sequence[int]) -> torch.Tensor:
@@ -112,7 +112,7 @@ class DistributedGroup(Group):
 
 
 def launched_by_torchrun() -> bool:
-    """Whether this process is one of torchrun's, of which there may be one only."""
+    """Whether torchrun started this process, even if it is the only one."""
     return {"RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR"} <= set(os.environ)
 
 

@@ -44,7 +44,7 @@ class PromptInterrupt:
 class DelayedInterrupt:
     """A context in which the first Ctrl-C, SIGTERM or SIGHUP sets `asked`; a second one acts at once, as elsewhere.
 
-    Does nothing outside the main thread, which alone may handle signals, and leaves a signal that has a handler of
+    Does nothing outside the main thread, since only that may handle signals, and leaves a signal that has a handler of
     somebody else's, as SIGHUP under nohup.
     """
 
@@ -53,7 +53,7 @@ class DelayedInterrupt:
         torchrun passes the signal on; it kills them after half a minute.
         """
         self.patient = patient
-        self.asked: Optional[KeyboardInterrupt] = None  # what is to be raised once all is saved
+        self.asked: Optional[KeyboardInterrupt] = None  # raised after everything is saved
         self._usual: Dict[int, Any] = {}
 
     def __enter__(self) -> DelayedInterrupt:

@@ -43,7 +43,7 @@ def make_folder(path: str) -> None:
 
 
 def locked(path: str, shared: bool = False) -> IO[str]:
-    """The file, open and locked: alone, or together with others who share it. Raises TrainerError where it is taken.
+    """The file, open and locked: exclusively, or shared with other processes. Raises TrainerError where it is taken.
 
     A file system that knows no locks keeps nobody away.
     """

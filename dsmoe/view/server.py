@@ -37,7 +37,7 @@ class Controls:
     """The panel in the browser."""
 
     def __init__(self, gui: Any, blend: Blend, changed: Any) -> None:
-        """gui: viser's. changed(): called whenever something else is to be shown."""
+        """gui: viser's. changed(): called whenever the picture has to change."""
         self.shown = gui.add_dropdown("show", SHOWN)
         self.mode = gui.add_dropdown("blend", BLEND_MODES, initial_value=blend.mode)
         self.gate = self._gate(gui, "background gate", blend.background_gate)
@@ -204,7 +204,7 @@ class _Client:
     def __init__(self, handle: Any) -> None:
         self.handle = handle
         self.text = handle.gui.add_markdown("", order=-1)  # above the controls
-        self.due = True  # something is to be shown that is not
+        self.due = True  # the picture shown is out of date
         self.sharp = False  # the last picture had full size
         self.moved = 0.0  # when the camera moved last
         self.seconds_per_pixel = 0.0
@@ -225,7 +225,7 @@ class _Client:
     def _show(self, followed: Followed, look: Look) -> str:
         self.due = False
         camera = camera_of(self.handle.camera, MOST_PIXELS)
-        if camera is None:  # the browser has not said its size yet
+        if camera is None:  # the browser's size is not known yet
             self.due = True
             return ""
         moves = time.monotonic() - self.moved < REST_SECONDS

@@ -257,7 +257,7 @@ struct PixelGradient {
   double background = 0, lambda = 0;
 };
 
-// The pairs in front of `middle` belong to another walk, which knows those behind by their sum alone.
+// The pairs in front of `middle` belong to another walk, which knows only the sum of those behind.
 template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel, const Weights& g, int middle = 0) {
   const Finished forward = blended<kMode, Real>(pixel);
   const PixelEnd<Real> end = {Real(forward.transmittance), Real(forward.denominator_part), Real(pixel.lambda),

@@ -123,7 +123,7 @@ TEST(ImageFactor, BackwardIsTheDerivative) {
   expect_gradient(actual, loss, x);
 }
 
-// A loss of the determinant before the low-pass filter alone, which is what by_adjugate is the derivative of.
+// A loss of only the determinant before the low-pass filter; by_adjugate is its derivative.
 TEST(ImageFactor, BackwardOfTheDeterminantIsTheDerivative) {
   const Vector x = Random(14).uniforms(18);
   auto loss = [&](const Vector& v) { return 1.7 * conic_of(factor_of(v)).unfiltered; };

@@ -241,7 +241,7 @@ TEST(AlphaCut, CutsFaintPairsOutsideThreeSigmaAlone) {
     EXPECT_NEAR(squared_reach(Cut::kKernel, opacity, cut.of(opacity)), 9, 1e-5);
   }
   EXPECT_EQ(AlphaCut<double>(0.5, 0.255f).of(1e-9), 0.5) << "the caller's alpha_min cuts everywhere";
-  EXPECT_EQ(AlphaCut<double>(0, 0).of(0.7), 0) << "Eq. 7 cuts on G alone";
+  EXPECT_EQ(AlphaCut<double>(0, 0).of(0.7), 0) << "Eq. 7 cuts only on G";
   EXPECT_EQ((AlphaCut<float>(0, 0.1f).faint), static_cast<float>((AlphaCut<double>(0, 0.1).faint)));
 }
 

@@ -94,7 +94,7 @@ TEST(RunThreads, PassesOneOfSeveralExceptionsOn) {
 
 // ---- The pool ----
 
-// The threads that run `count` workers, each of which waits for the others; fewer where that takes 10 seconds.
+// The threads that run `count` workers. Each worker waits for the others, up to 10 seconds.
 std::set<pid_t> threads_that_meet(int count) {
   std::atomic<int> arrived{0};
   std::vector<pid_t> threads(count);

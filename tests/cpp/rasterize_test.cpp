@@ -91,7 +91,7 @@ TYPED_TEST(RasterizeIn, EqualsBruteForceWithAnyNumberOfChannels) {
     scene.background = Random(5).uniforms(channels);
     scene.background.push_back(0.15);
     scene.config.num_channels = channels;
-    scene.config.depth = channels == 2;  // three features, of which one is no colour
+    scene.config.depth = channels == 2;  // three features: two colours and the depth
     expect_brute_force(scene);
     expect_brute_force(convert<float>(scene));
   }

@@ -97,7 +97,7 @@ def threshold_margin(scene):
             if settings.alpha_min > 0:
                 distances.append(log_alpha - math.log(settings.alpha_min))
             if gate > 0:
-                # Where the opacity is so small that 3 sigma count, the cut is on G alone.
+                # Where the opacity is so small that 3 sigma count, the cut is only on G.
                 cut = math.log(float(gate) * reference.ALPHA_MIN)
                 distances.append(torch.maximum(log_alpha - cut, power - math.log(reference.KERNEL_KEPT)))
         counts = reference.pair_counts(splats, x, y, settings, mode, gate)

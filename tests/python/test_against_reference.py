@@ -184,7 +184,7 @@ def test_the_optional_outputs_do_not_change_the_colour(mode):
 
 
 def test_clamp_color_decides_on_colours_below_zero(mode, device):
-    """Those of harmonics alone: given colours are used as they are."""
+    """Only those of harmonics: given colours are used as they are."""
     scene = random_scene(mode, degree=3, seed=26, bg=torch.zeros(3))
     least = {clamp: diff_smoe_rasterization.rasterize(
         settings=scene.settings._replace(clamp_color=clamp), **scene.inputs).color.min() for clamp in (True, False)}

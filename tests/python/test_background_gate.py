@@ -1,4 +1,4 @@
-"""The background as an expert: what `background_gate` alone does, its ends, its cut, its gradient, its errors.
+"""The background as an expert: what only `background_gate` does, its ends, its cut, its gradient, its errors.
 
 What holds in every mode is tested with a gate where it is tested with the modes (`with_gate` in scenes.py). A test that
 takes `function` is asked of the reference too, for which it is by hand.
@@ -230,7 +230,7 @@ def test_an_empty_pixel_is_the_background_itself(dtype):
 
 @pytest.mark.parametrize("gate", [1e-3, 0.05, 1.0, 20.0])
 def test_dL_dlambda_equals_a_finite_difference(function, gate):
-    """Of a whole image, in which pairs come and go with lambda no nearer than the step."""
+    """The gradient of a whole image. Pairs enter and leave at no lambda within the finite-difference step."""
     scene = random_scene("smoe_eq7", 30, 24, 18, seed=3, scale=0.3, opacity=(0.05, 0.9), degree=1)
     weights, step = random_normal((6, 18, 24), 4), 1e-5
 
@@ -300,7 +300,7 @@ def test_a_gate_that_cannot_be_is_named(function, mode, gate):
 
 
 def test_a_mode_with_a_gate_of_one_is_no_alpha(monkeypatch):
-    """Of a mode that the core may get: only `smoe` is `alpha` at 1."""
+    """Only `smoe_eq7` becomes `alpha` at gate 1; another mode keeps its name."""
     monkeypatch.setattr(settings_module, "BLEND_MODES", BLEND_MODES + ("own",))
     monkeypatch.setitem(settings_module._FIXED_GATES, "own", 1.0)
     settings = random_scene("smoe_eq7", 1, 2, 2).settings._replace(blend_mode="own", background_gate=None)

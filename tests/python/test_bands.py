@@ -11,7 +11,7 @@ from diff_smoe_rasterization import rasterize, rasterize_with_splats
 from diff_smoe_rasterization.extension import _C
 from diff_smoe_rasterization.settings import OUTPUTS
 
-# Of 4,000 instances and more in six rows of tiles: bands of one row and of two, and rows that have more by themselves.
+# Six rows of tiles with 4,000 instances or more: bands of one or two rows, and single rows that exceed a band.
 MOST = (1500, 100)
 
 

@@ -86,7 +86,7 @@ def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
     rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
     blended = rendering.color > 0
     denominator = rendering.alpha + gate_of(mode) * (1 - rendering.alpha)
-    if blend_of(mode) == "smoe":  # whose alpha is W / D, with W = 1 - T
+    if blend_of(mode) == "smoe":  # its alpha is W / D, with W = 1 - T
         denominator = (1 - transmittance_of(scene)) / rendering.alpha.clamp(min=1e-30)
     weights = (rendering.color * denominator).double()
     y, x = torch.meshgrid(torch.arange(43), torch.arange(61), indexing="ij")

@@ -226,7 +226,7 @@ add_executable(program program.cpp)
 target_link_libraries(program PRIVATE dsmoe::{name})
 """)
     build(tmp_path, tmp_path / "build")
-    if name != "cuda":  # whose program needs a GPU
+    if name != "cuda":  # its program needs a GPU
         run(tmp_path / "build" / "program", cwd=str(tmp_path))
 
 

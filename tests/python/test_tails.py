@@ -100,7 +100,7 @@ def test_a_tail_by_hand(function, depths):
     expected = [(o[0] * c + tail * b) / (o[0] + tail) for c, b in zip((0.9, 0.5, 0.1), background)]
     assert rendering.color[:, 0, 20].tolist() == pytest.approx(expected, rel=1e-6)  # 1e-7 in the clip w
     assert rendering.alpha[0, 0, 20].item() == pytest.approx(o[0] / (o[0] + tail), rel=1e-9)
-    # The tail's Gaussian has no gradient there, and the other one that of its own weight alone.
+    # The tail's Gaussian has no gradient there, and the other one only that of its own weight.
     by_opacity, = torch.autograd.grad(rendering.color[0, 0, 20], opacities)
     assert by_opacity[1].item() == 0
     assert by_opacity[0].item() == pytest.approx((0.9 - expected[0]) / (o[0] + tail), rel=1e-6)

@@ -25,7 +25,7 @@ def opcheck_rasterize(scene):
     """torch.library.opcheck of the op `rasterize`.
 
     Its last part, test_aot_dispatch_dynamic, runs the op twice and wants every result equal. On a GPU some of what is
-    kept for the backward pass is memory that nobody has written: rows of culled Gaussians, instances behind the last
+    kept for the backward pass is memory that is never written: rows of culled Gaussians, instances behind the last
     one. So there that part is done here, on what a caller gets: the images, the radii and the gradients.
     """
     op, arguments = torch.ops.diff_smoe_rasterization.rasterize.default, op_arguments(scene)

@@ -36,7 +36,7 @@ template <class S> class Tree {
     split(0, count);
   }
 
-  // Of the point in that place of the order, which does not count itself.
+  // For the point at this position of the order; the point itself does not count.
   Nearest nearest(int64_t place) const {
     Nearest found;
     search(0, static_cast<int64_t>(order_.size()), place, found);

@@ -21,7 +21,7 @@ struct Job {
   const std::function<void(int)>& worker;
   const int count;
   int next = 0;                          // the first index that no thread has taken
-  int running = 0;                       // indices that are taken and have not ended
+  int running = 0;                       // indices that are taken and still run
   std::exception_ptr failure = nullptr;  // the first
 };
 

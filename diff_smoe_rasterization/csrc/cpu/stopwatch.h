@@ -1,4 +1,4 @@
-// Adds the seconds between its construction and its destruction to a stage. Does nothing where nobody wants times.
+// Adds the seconds between its construction and its destruction to a stage. Does nothing if no times are asked for.
 #pragma once
 
 #include <chrono>

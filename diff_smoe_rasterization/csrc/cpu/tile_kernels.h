@@ -23,7 +23,7 @@ template <class S> struct Tile {
   int64_t begin, end;  // its instances
 };
 
-// What the backward pass of a tile reads and writes besides.
+// Further inputs and outputs of a tile's backward pass.
 template <class S> struct TileGradients {
   const ImageOutputs<S>& images;
   const ImageGradients<S>& dL_dimages;
@@ -49,7 +49,7 @@ constexpr int record_size(int num_features, bool absolute) {
   return kNumGateMoments + num_features + (absolute ? kNumAbsoluteSums : 0);
 }
 
-constexpr int kImportanceArrays = 8;  // numbers a pixel besides its channels
+constexpr int kImportanceArrays = 8;  // numbers a pixel, in addition to its channels
 
 // Numbers of scratch memory that one tile needs, for any of the kernels: for each pixel its features and at most six
 // others, and for each feature the largest pack.

@@ -286,7 +286,7 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
 //   kMode, kBackToFront   how pairs are cut, and the direction
 //   expect(slot)          the slot of a Gaussian that will soon come
 //   begin(gaussian)       returns the sums of a Gaussian, in registers
-//   wanted(at, pixels)    whether pairs of a pack are wanted, and of which pixels; at: of the first in a PixelArray
+//   wanted(at, pixels)    whether a pack's pairs are wanted, and for which pixels; at: the first in a PixelArray
 //   take(at, pairs, pixels, sums)   a pack of pairs
 //   end(gaussian, sums)
 // Between `begin` and `end`, `wanted` is asked of each pack that the footprint may meet. Where it says so, `take`

@@ -45,7 +45,7 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
 };
 
 // Sums a batch by tensor cores, and gives the sums of its `count` Gaussians to the sink. Where the batch is not full,
-// the other rows hold what an earlier one left; nobody takes their sums. kRecord: numbers of a record.
+// the other rows hold old values, and their sums are not used. kRecord: numbers of a record.
 template <int kRecord, class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
                           const TensorBasis& basis, const StagedGaussian<float, true>* gaussians,

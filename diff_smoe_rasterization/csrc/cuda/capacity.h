@@ -36,7 +36,7 @@ class InstanceCapacities {
 
  private:
   struct Count {
-    // Of the latest rendering that the device has finished. Pinned memory, which the device writes. It is never freed,
+    // Counts of the latest finished rendering, in pinned memory that the device writes. It is never freed,
     // because a captured graph may write it at any time; another key may get it.
     int64_t* latest = nullptr;
     int64_t num_gaussians = 0;  // of the latest rendering that was launched; `latest` may be of the one before

@@ -1,7 +1,7 @@
 // Sums of integers in place of real numbers, for gradients that are the same bits every time: integers have the same
 // sum in any order. A term is rounded to a whole number of units. The unit of a sum is a power of two, far below the
 // most that the sum can be, so that the sum does not overflow. A term that is small even in these units leaves its rest
-// to a second integer, so that a Gaussian of which little is seen keeps its digits.
+// to a second integer, so that a hardly visible Gaussian keeps its digits.
 //
 // The most that a sum can be, with the names of blend.h. A weight w is at most D, the pixel's denominator, so
 // |w g'| <= |dL/df|. The pairs behind a pair weigh at most T (1 - alpha) together, so alpha / (1 - alpha) |R| is at
@@ -30,7 +30,7 @@ constexpr int kSumBits = 60;
 // The rest of a term below the unit is counted in units of 2^-kRestBits: 2^24 rests of at most half a unit fit.
 constexpr int kRestBits = 38;
 // Terms of this many units or more have no rest that matters: the sums over a warp's pixels have 20 good bits in float.
-// Of double every bit is kept.
+// A double keeps every bit.
 template <class S> constexpr S kNoRest = sizeof(S) == sizeof(float) ? S(1 << 21) : S(int64_t(1) << 53);
 
 // What bounds the sums of one Gaussian, as exponents.

@@ -458,7 +458,7 @@ struct GiveArguments {
   int32_t* tile_order;           // [tiles] written
 };
 
-// Where the instances do not fit, only the order of tiles is written, because nobody reads the lists then.
+// If the instances do not fit, only the order of tiles is written, because the lists are then not read.
 __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_constant__ GiveArguments arguments) {
   __shared__ uint32_t counts[kChunk / kWarp][kTilesPerMacro];
   __shared__ unsigned long long begins[kTilesPerMacro];
@@ -479,7 +479,7 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
     const int32_t gaussian = exists ? arguments.gaussians[entry] : 0;
 
     // Where this chunk's instances of each tile begin: behind those of the macro tile's earlier chunks.
-    __syncthreads();  // of the chunk before nobody reads any more
+    __syncthreads();  // wait until all reads of the previous chunk are done
     if (threadIdx.x < kTilesPerMacro) {
       const int x = chunk.macro % arguments.macro_columns * kMacroTiles + threadIdx.x % kMacroTiles;
       const int y = chunk.macro / arguments.macro_columns * kMacroTiles + threadIdx.x / kMacroTiles;
@@ -521,7 +521,7 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
 }
 static_assert(kWarp == 2 * kTilesPerMacro, "two halves of a warp add up each tile's earlier chunks");
 
-// Blocks for `pieces` at most, of a kernel whose blocks take piece after piece.
+// Number of blocks for a kernel whose blocks take piece after piece, at most `pieces`.
 unsigned resident_blocks(int64_t pieces) {
   return static_cast<unsigned>(min(pieces, int64_t(kResidentBlocks) * num_multiprocessors()));
 }

@@ -55,7 +55,7 @@ int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& ke
   return std::min(most, count + count / 8 + 1);
 }
 
-// Allocates what frame.saved has not got yet, but what depends on the number of instances.
+// Allocates the missing arrays of frame.saved whose sizes do not depend on the instance count.
 template <class S> SavedSizes begin_saved(Frame<S>& frame, const Run& run, Allocator& memory) {
   const SavedSizes sizes = saved_sizes(frame, run);
   allocate_saved(frame.saved, sizes, memory);

@@ -57,7 +57,7 @@ template <class S> __device__ void store_order(const OrderTargets<S>& to, int64_
   }
 }
 
-// Of no Gaussians there is no thread to say so.
+// Without Gaussians no thread runs, so the host writes the zero.
 template <class S> void order_nothing(const Frame<S>& frame, cudaStream_t stream) {
   if (frame.saved.num_ordered == nullptr) return;
   check(cudaMemsetAsync(frame.saved.num_ordered, 0, sizeof(int64_t), stream), "projecting Gaussians");

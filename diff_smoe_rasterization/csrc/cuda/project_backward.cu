@@ -11,13 +11,13 @@ static_assert(kCameraGradientSize == 35, "view, projection and position lie side
 
 template <class S> struct ProjectBackwardArguments {
   GaussianInputs<S> inputs;        // of the forward pass
-  DeviceCamera<S> camera;          // likewise
-  RasterConfig<S> config;          // likewise
+  DeviceCamera<S> camera;          // of the forward pass
+  RasterConfig<S> config;          // of the forward pass
   SavedForward<S> saved;           // projected and features are read
   const int32_t* radii;            // [N] pixels; above 0 where a Gaussian was seen
   const S* dL_dgaussians;          // [N, kNumGateMoments + F] the records
   bool by_footprints;              // which are gradients by the footprints, not sums over pixels
-  const S* dL_ddepths;             // [N] gradients by the view depths, besides what the features say; or null
+  const S* dL_ddepths;             // [N] gradients by the view depths, added to those of the features; or null
   GaussianGradients<S> gradients;  // written
   S* camera_rows;                  // [warps, kCameraGradientSize] each warp's sums, written; or null
 };

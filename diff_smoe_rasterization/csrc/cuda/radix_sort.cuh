@@ -90,7 +90,7 @@ template <class T> __device__ T sum_before_thread(T own, T* warp_sums, T& total)
     const T before = __shfl_up_sync(kAllLanes, sum, step);
     if (lane >= step) sum += before;
   }
-  __syncthreads();  // of an earlier call nobody reads any more
+  __syncthreads();  // wait until all reads of the previous call are done
   if (lane == kWarp - 1) warp_sums[warp] = sum;
   __syncthreads();
   T before = 0;
@@ -123,7 +123,7 @@ __global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
   constexpr int kBins = 1 << kBits, kOwn = kBins / kSortBlock, kItems = kSortItems<Key>, kWarps = kSortBlock / kWarp;
   static_assert(kBins % kSortBlock == 0, "each thread has the same number of digits");
   __shared__ uint32_t warp_counts[kWarps][kBins];  // pairs of each digit, then those in the warps before
-  // Of each digit: its first place in the tile, and what is added to a place in the tile for that in the output.
+  // Per digit: its first slot in the tile, and the offset from tile slot to output slot.
   __shared__ uint32_t starts[kBins], places[kBins];
   __shared__ Key tile_keys[kSortTile<Key>];
   __shared__ int32_t tile_values[kSortTile<Key>];
@@ -244,7 +244,7 @@ __global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
       if (pass.sorted_keys != nullptr) pass.sorted_keys[place] = key;
       pass.sorted_values[place] = tile_values[k];
     }
-    __syncthreads();  // of this tile nobody reads any more
+    __syncthreads();  // wait until all reads of this tile are done
   }
 }
 

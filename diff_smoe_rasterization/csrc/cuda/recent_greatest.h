@@ -5,7 +5,7 @@
 
 namespace dsmoe {
 
-// Of at least the last kWindow numbers that were added, and of less than twice as many.
+// The greatest of the last n numbers added, kWindow <= n < 2 kWindow.
 class RecentGreatest {
  public:
   // More frames than a training has views, so that the largest view of each round is remembered until the next.

@@ -64,7 +64,7 @@ template <class S> __device__ bool is_idle_block(const SavedForward<S>& saved, i
   return int(blockIdx.x) >= queue_blocks(saved) + tiles;
 }
 
-// Of a block that is not idle. Tile -1 where the queue has no entry for the warp.
+// For a block that is not idle. Tile -1: the queue has no entry for the warp.
 template <class S> __device__ WarpSegment segment_of_warp(const SavedForward<S>& saved) {
   const int block = blockIdx.x, warp = threadIdx.x / kWarp, behind = block - queue_blocks(saved);
   if (behind >= 0) return {saved.tile_order[behind], warp, 0};

@@ -47,7 +47,7 @@ constexpr int kBackwardUnroll = 2;
 // Blocks of the backward walk that one multiprocessor holds at once, where the number of features is known: 5 x 128
 // threads leave each thread 96 registers, nearly all that the kernel asks for.
 constexpr int kBackwardBlocks = 5;
-// Of the general kernels: they take what they need.
+// The general kernels: as many registers as they need.
 constexpr int kGeneralWalkBlocks = 1;
 
 // Sums by tensor cores: how many Gaussians one warp sums together. They fill the 16 rows of an operand, eight rows for

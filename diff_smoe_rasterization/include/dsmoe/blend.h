@@ -141,7 +141,7 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real l
   return {power, weight};
 }
 
-// What a pixel sums. Each mode states its own as kLaw. Algebra that holds for the gates' law alone asks for it: a mode
+// What a pixel sums. Each mode states its own as kLaw. Algebra that holds only for the gates' law asks for it: a mode
 // of another law has no importance (kRemovable), and its backward pass walks long lists whole (kResumes).
 enum class Law {
   kGates,  // what GateBlend's parameters say

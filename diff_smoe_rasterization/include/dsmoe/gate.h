@@ -38,7 +38,7 @@ template <class Real, class S> struct ColumnExponent {
   DSMOE_HD Real at(Real dy) const { return fma(fma(Real(quadratic), dy, linear), dy, constant); }
 };
 
-// The least alpha that counts, besides what the cut says itself.
+// The least alpha that counts, in addition to the cut.
 template <class S> struct AlphaCut {
   S alpha_min;  // the caller's
   S faint;      // where pairs are cut by G: lambda / 255, and nothing inside 3 sigma

@@ -53,7 +53,7 @@ template <class S> struct ActivateBackward {
 // Adds one view to what densification knows: where the radius is positive, the length of the gradient on the screen,
 // and 1.
 template <class S> struct AddView {
-  const S* dL_dmeans2D;  // [N, 3], of which x and y count
+  const S* dL_dmeans2D;  // [N, 3]; z is not read
   const int32_t* radii;  // [N]
   S* gradient_sum;       // [N] added to
   S* view_count;         // [N] added to

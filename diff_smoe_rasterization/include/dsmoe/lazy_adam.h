@@ -1,4 +1,4 @@
-// Adam over rows of which a step reads few, with the results of dense Adam bit for bit.
+// Adam for tensors when a step reads only a few rows; results equal dense Adam bit for bit.
 //
 // A Gaussian that no view shows has no gradient, yet dense Adam moves it on by its momentum in every step, and that
 // costs as much memory traffic as a gradient does. Nobody reads the row before a view shows the Gaussian again. So its

@@ -189,7 +189,7 @@ template <class S> struct ImportanceMap {
   ImportanceSums<S> sums;
 };
 
-// Of each pixel; both are written whole.
+// Per pixel; both are written whole.
 struct GateMap {
   int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 where none is
   int32_t* counts = nullptr;     // [H, W] how many Gaussians the numerator has
@@ -226,7 +226,7 @@ template <class S> struct GaussianGradients {
 constexpr int kNumGateGradients = 6;  // by the centre's x and y, the conic's xx, xy and yy, and the opacity
 template <class S> struct FootprintGradients {
   S* records = nullptr;       // [N, kNumGateGradients + F] those of the gate, then by the features
-  const S* depths = nullptr;  // [N] by the view depth, besides what the features say; or null. No blend writes it.
+  const S* depths = nullptr;  // [N] by the view depth, added to that of the features; or null. No blend writes it.
 };
 
 // One rendering, from its inputs to what it leaves for the backward pass. The backends differ in where the camera lies

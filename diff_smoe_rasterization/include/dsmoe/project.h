@@ -30,7 +30,7 @@ template <class S> struct ProjectionRules {
   bool inverse_depth;  // 1 / z is blended too
 };
 
-// One Gaussian on the image plane: all that the blend reads of it besides its features. Aligned to load as vectors.
+// One Gaussian on the image plane: all that the blend reads of it except its features. Aligned to load as vectors.
 template <class S> struct alignas(16) ProjectedGaussian {
   Vec2<S> mean;     // pixels
   Sym2<S> conic;    // per px^2
@@ -70,10 +70,10 @@ template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, TileGrid grid, 
 // A Gaussian's covariance on the image plane, and what the backward pass needs of its making.
 template <class S> struct Covariances {
   Vec3<S> scale;     // modified; where the covariance is not given
-  Mat3<S> rotation;  // likewise
+  Mat3<S> rotation;  // where the covariance is not given
   ProjectionJacobian<S> jacobian;
   Mat23<S> axes;
-  ImageFactor<S> factor;  // likewise
+  ImageFactor<S> factor;  // where the covariance is not given
   Sym2<S> image;          // px^2, before the low-pass filter
   Conic<S> conic;
 };

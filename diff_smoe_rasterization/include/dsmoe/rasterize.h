@@ -5,7 +5,7 @@
 //     cpu::forward(frame, heap);                  // the images, and what the backward pass needs
 //     cpu::backward(frame, gradients);            // from gradients by the images to gradients by the inputs
 //
-// Who projects in one place and blends in another has the same in two halves:
+// To project on one device and blend on another, call the two halves:
 //
 //     cpu::project(frame);                        // the footprints: saved.projected, saved.features and images.radii
 //     cpu::blend_footprints(other, heap);         // the images of some footprints, those of several frames maybe

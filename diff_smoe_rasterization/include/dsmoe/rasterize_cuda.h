@@ -6,7 +6,7 @@
 //     cuda::forward(frame, {stream}, memory);     // the images, and what the backward pass needs
 //     cuda::backward(frame, gradients, {stream}, memory);
 //
-// Who projects in one place and blends in another has the same in two halves, as in rasterize.h: `project_footprints`,
+// To project on one device and blend on another, call the two halves, as in rasterize.h: `project_footprints`,
 // `blend_footprints`, `blend_footprints_backward`, `project_footprints_backward`.
 //
 // The stages that all these run, in their order, are declared below and can be called one by one.
@@ -206,7 +206,7 @@ struct Work {
 // sorts, the greatest number for culled Gaussians; null where no depth order is wanted.
 template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, const Work& work);
 
-// Fills frame.images.radii alone, where there are at most kMostHeldFeatures features.
+// Fills only frame.images.radii, where there are at most kMostHeldFeatures features.
 constexpr int kMostHeldFeatures = 8;
 template <class S> void project_radii(const Frame<S>& frame, const Work& work);
 

@@ -18,9 +18,9 @@
 //
 //   C'_k - C = -alpha_k (T_k (c_k - C) + A_k) / ((1 - alpha_k) D'_k)
 //
-// The ablations divide by sum alpha, of which alpha_k goes; in smoe_std nothing is seen through anything, so q_k is 0.
+// The ablations divide by sum alpha, which loses alpha_k. In smoe_std Gaussians do not occlude, so q_k is 0.
 // A pixel that no other Gaussian and no background's gate is in shows the background's colour. This is exact but for
-// what lies behind a pixel's early stop, of which nothing is known, and for owners behind a pair that have less than
+// Gaussians behind a pixel's early stop, which are not walked, and for owners behind a pair that have less than
 // 1e-6 of W in float: their weights are lost in the rounding of W. In smoe_tn that is 1e-6 of sum alpha, divided by
 // 1 - alpha_k.
 #pragma once

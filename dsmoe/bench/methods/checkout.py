@@ -184,7 +184,7 @@ class C3DGS(ThreeDGS):
 
 
 class InOneProcess(ThreeDGS):
-    """train.py alone: it also renders the test views, or the observer does when it is done."""
+    """Only train.py: it also renders the test views, or the observer does when it is done."""
 
     def train(self) -> Dict[str, Any]:
         return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
@@ -207,7 +207,7 @@ class HAC(InOneProcess):
 
 
 class DBS(InOneProcess):
-    """Deformable Beta Splatting: train.py alone; the number of primitives is given (`--cap_max`), no threshold.
+    """Deformable Beta Splatting: only train.py; the number of primitives is given (`--cap_max`), no threshold.
 
     Its own `--eval` keeps the model that is best on the test views. Here they are held out, and that is all.
     """
@@ -287,7 +287,7 @@ def matched(scene: Scene, seen: List[Dict[str, Any]], label: str) -> List[Tuple[
     wrong = sorted(expected ^ set(by_name))
     if wrong:
         raise BenchError(f"{label} rendered {len(by_name)} test views, the split has {len(expected)} "
-                         f"({', '.join(wrong[:3])}, ... are in one of them alone): another split gives other figures")
+                         f"({', '.join(wrong[:3])}, ... are only in one of them): another split gives other figures")
     return [(view, by_name[Path(view.camera.name).stem]) for view in scene.test]
 
 

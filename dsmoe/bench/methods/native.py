@@ -36,7 +36,7 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     row = train_on(gpus, config) if gpus > 1 else train(config, resume=True, progress=False, scene=scene)
     # The peak of a part of the training would be taken for that of the whole.
     peak = torch.cuda.max_memory_allocated() / 2**20 if on_gpu and gpus == 1 and not continued else None
-    measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, of which its networks are no part
+    measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, since LPIPS takes memory
     ply, history = model_path(folder, config.iterations), os.path.join(folder, HISTORY_NAME)
     renderer = open_renderer(config, ply, config.blend_mode, config.device)
     evaluation = evaluate(renderer, scene.test, config.device, measure=measures, passes=1)  # as in checkouts

@@ -21,8 +21,8 @@ ABLATION = {"smoe": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d
 COMPARED = ("alpha", "smoe")
 SEEDS = "seeds"  # the column that says how many seeds an average over scenes is of
 MOST_PAIRS = 20  # are named in a note
-SHARED_NOTE = (f"Times and FPS are of cells that had their GPU or CPU alone. {grouping.SHARED}: several cells had it "
-               "at once, so theirs are not the machine's; the rows have them.")
+SHARED_NOTE = (f"Times and FPS are of cells that shared no GPU or CPU. {grouping.SHARED}: several cells ran on "
+               "it at once, so their times are left out; the rows have them.")
 SPREAD_NOTE = "± is the sample standard deviation over seeds; figures without it are of one seed."
 
 ByScene = Dict[str, Group]
@@ -242,7 +242,7 @@ def _by_dataset(groups: Sequence[Group]) -> Dict[str, List[str]]:
 
 
 def _scene_notes(ours: Dict[str, List[str]]) -> List[str]:
-    notes = [f"{dataset}: ours is of {', '.join(ours[dataset])} alone; the paper averages {len(scenes)} scenes."
+    notes = [f"{dataset}: ours is only of {', '.join(ours[dataset])}; the paper averages {len(scenes)} scenes."
              for dataset, scenes in PAPER["datasets"].items() if dataset in ours and ours[dataset] != sorted(scenes)]
     absent = [dataset for dataset in PAPER["datasets"] if dataset not in ours]
     if absent:

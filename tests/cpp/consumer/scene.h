@@ -1,4 +1,4 @@
-// One Gaussian in the middle of an image, seen along z, of which everything is known: gated blending of a single expert
+// One Gaussian in the middle of an image, seen along z. Its image is known: gated blending of a single expert
 // gives its colour, exactly, where the Gaussian is, and the background elsewhere.
 #pragma once
 

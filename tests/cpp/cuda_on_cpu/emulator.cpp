@@ -49,7 +49,7 @@ struct Fiber {
 // Threads that wait for each other: those of a warp, or of a block.
 struct Group {
   Fiber::State state;          // of a thread that waits
-  unsigned first, live, size;  // threads; those that have not ended
+  unsigned first, live, size;  // threads; live: still running
   unsigned waiting = 0;
   Place place = {};  // where the first of them waits
 };
@@ -73,7 +73,7 @@ void to_scheduler() {
   if (_setjmp(fibers[running]->resume) == 0) _longjmp(scheduler, 1);
 }
 
-// Where all wait that have not ended, they may go on.
+// When all running threads wait, they may go on.
 void end_wait(Group& group) {
   if (group.waiting < group.live) return;
   group.waiting = 0;

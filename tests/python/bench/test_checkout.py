@@ -132,7 +132,7 @@ def test_c3dgs_compresses_what_another_checkout_has_trained(small, started, tmp_
     ("dbs", {"variant": "unpatched", "blend_mode": "alpha", "arguments": ["--cap_max", 12]},
      "--cap_max 12 --disable_viewer --no-compress", ["--eval", "--blend_mode"])])
 def test_trainers_of_one_process_have_rules_of_their_own(name, method, there, absent, small, started, tmp_path):
-    """And no Gaussians of 59 numbers. Of Deformable Beta Splatting's --eval the observer takes the split alone."""
+    """And no Gaussians of 59 numbers. Of Deformable Beta Splatting's --eval the observer takes only the split."""
     cell = small(name, **method)
     shape = shapes.SHAPES[name](cell, shapes.config_of(cell), str(tmp_path))
     assert shape.train() == shape.render() and len(started) == 1

@@ -346,7 +346,7 @@ def test_cells_are_spread_over_gpus(jobs, per_gpu, cells, cores, gpu, per_device
 
 @pytest.fixture
 def on_gpus(content, monkeypatch):
-    """A suite of 16 cells for GPUs, of which three are visible."""
+    """A suite of 16 cells for GPUs; three GPUs are visible."""
     content["protocol"].update(device="cuda", principal_point="centre")
     monkeypatch.setattr(engine, "threads_of_each", lambda at_once: 24 // at_once)
     monkeypatch.setattr(engine, "visible_gpus", lambda: ["0", "2", "3"])

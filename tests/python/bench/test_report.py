@@ -75,7 +75,7 @@ def test_the_papers_figures_stand_beside_ours_and_are_marked():
                for name in ("PSNR [dB]", "SSIM", "LPIPS, paper's", "#G [M]", "own size [MB]")]
     assert figures == ["24.43", "0.69", "0.39", "0.064", "15.4"] and printed["dense", "2DGS"][0].printed == "26.88"
     assert printed["sparse", "3DSMoES"][columns.index("fox PSNR [dB]")].value is None
-    assert any("bonsai alone; the paper averages 9 scenes" in note for note in table.notes)
+    assert any("only of bonsai; the paper averages 9 scenes" in note for note in table.notes)
     assert any("Deep Blending and Tanks and Temples are left out" in note for note in table.notes)
 
 
@@ -178,7 +178,7 @@ def test_times_of_cells_that_shared_their_gpu_are_left_out():
     table, delta = table_of(entries, "cells"), table_of(entries, "deltas")
     assert shown(table, "train [s]", "wall [s]", "FPS", "PSNR [dB]", method="native, smoe") == [
         "shared", "shared", "shared", "21.00"]
-    assert shown(table, "train [s]", threshold="0.0002") == ["8,000 ± 1,414"]  # of the seeds that were alone
+    assert shown(table, "train [s]", threshold="0.0002") == ["8,000 ± 1,414"]  # of the seeds that did not share
     assert shown(delta, "Δ PSNR [dB]", "train ratio", "FPS ratio") == ["+1.00", "shared", "shared"]
     assert layouts.SHARED_NOTE in table.notes and layouts.SHARED_NOTE in delta.notes
 
@@ -224,7 +224,7 @@ def test_rows_of_a_rarer_protocol_are_left_out_and_named(name, value):
 
 
 def test_rules_that_one_row_does_not_state_are_not_compared():
-    """Rows of earlier versions state fewer, and a checkout's recipe has not all names of the native one."""
+    """Rows of earlier versions state fewer, and a checkout's recipe lacks some names of the native one."""
     bare = {name: value for name, value in PROTOCOL.items() if name not in ("recipe", "sh_degree")}
     entries = [row(protocol={**bare, "scale_recipe": None}), row(seed=1),
                row(seed=2, protocol={**PROTOCOL, "recipe": {"feature_lr": 0.0025, "opacity_lr": None}})]

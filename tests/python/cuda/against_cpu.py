@@ -22,7 +22,7 @@ class Tolerance(NamedTuple):
 FLOAT64 = Tolerance(1e-11, 1e-11)
 # A position of some hundred pixels is rounded by 3e-5, which can change the alpha of the smallest splats (0.55 px) by
 # 2e-4 of itself, a part of a pixel. In a gradient, sums of thousands of terms that cancel multiply 6e-8 by 1e3.
-# A pair within rounding of a threshold may count on one side alone; such pixels are counted, and take no part.
+# A pair within rounding of a threshold may count on only one side; such pixels are counted, and take no part.
 FLOAT32 = Tolerance(1e-4, 1e-4, 1e-5)
 GATE = "background_gate"
 

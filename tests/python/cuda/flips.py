@@ -60,7 +60,7 @@ def pixels_of(splats, settings, mode, x, y):
         splats.conic[:, 0] * splats.conic[:, 2] - splats.conic[:, 1] ** 2)
     rounding = ALPHA + shift * slope - COVARIANCE * condition[:, None] * power
     above_cut = splats.opacity[:, None].log() + power - cut
-    # A footprint in the tile's list for one program alone.
+    # A footprint that only one program lists for the tile.
     listed = torch.stack([in_tile(splats._replace(position=splats.position + move), x, y, settings, mode)
                           for move in (0, shift, -shift)])
     counts = (above_cut >= 0) & listed[0]

@@ -89,7 +89,7 @@ def test_random_scenes(mode, name, dtype, tolerance, gpu):
 @pytest.mark.parametrize("camera", [False, True], ids=["fixed_camera", "camera"])
 @pytest.mark.parametrize("split_dc", [False, True], ids=["harmonics", "split_harmonics"])
 def test_what_trainers_render(mode, split_dc, camera, gpu):
-    """Colours of degree 3 alone, in float32: kernels are compiled for them, with and without the camera's gradients."""
+    """Only colours of degree 3, in float32: kernels are compiled for them, with and without the camera's gradients."""
     scene = crowd(mode, degree=3, split_dc=split_dc)
     assert scene.inputs["means3D"].shape[0] % 32 > 0, "the last warp must be a part of one"
     rendering = compare(scene, gpu, torch.float32, (), FLOAT32, camera)

@@ -50,7 +50,7 @@ def test_float32_is_near_the_cpu(mode, name, gpu):
     expected = scores(scene, "cpu", torch.float64, pixel_weights)[3]
     actual = scores(scene, gpu, torch.float32, pixel_weights)[3]
     different = (actual.pixels.cpu() - expected.pixels).abs()
-    # A pair within rounding of a threshold may count on one side alone: 1e-5 of what pairs there are, as of pixels in
+    # A pair within rounding of a threshold may count on only one side: 1e-5 of what pairs there are, as of pixels in
     # test_cuda_against_cpu. In small scenes that is less than one.
     assert different.sum() <= max(3, 2e-5 * expected.pixels.sum())
     same = different == 0

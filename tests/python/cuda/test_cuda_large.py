@@ -36,7 +36,7 @@ def needs(gigabytes):
 @needs(100)
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_fifty_million_gaussians(mode, large_gpu):
-    """Some thousand visible ones among them, up to the last, look and learn as they do alone."""
+    """A few thousand visible ones among them, up to the last, have the image and gradients they have by themselves."""
     few = random_scene(mode, 5000, 320, 213, scale=0.03, degree=3, dtype=torch.float32).to(large_gpu)
     index = torch.linspace(0, MANY - 1, 5000, dtype=torch.float64, device=large_gpu).long()
     assert index[-1] == MANY - 1
@@ -67,7 +67,7 @@ def test_fifty_million_gaussians(mode, large_gpu):
 def test_more_tile_instances_than_32_bits_count(mode, large_gpu):
     """Layers without end: every Gaussian is as good as constant over the image, so that the pixels are known.
 
-    In bands, or the lists alone would take 57 GB while they are sorted.
+    In bands; otherwise the lists would take 57 GB while they are sorted.
     """
     assert (SIDE // 16) ** 2 * LAYERS > 2 ** 31
     settings = camera_settings(SIDE, SIDE, position=(0.0, 0.0, -1.0), bg=torch.zeros(1), dtype=torch.float32,

@@ -21,7 +21,7 @@ def test_more_macro_tiles_than_one_pass_sorts(mode, gpu):
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_needles_that_pass_by_more_macro_tiles_than_they_meet_tiles(mode, gpu):
     """Their boxes outgrow the room that the count of their tiles suggests. So the entries of the macro tiles' lists are
-    counted too, and the first rendering has room. It had not while tiles alone were counted.
+    counted too, and the lists of the first rendering fit their memory.
     """
     scene = random_scene(mode, 300, 2391, 2377, scale=0.01, degree=0, dtype=torch.float32)
     needle = torch.tensor([6.0, 0.001, 0.001])

@@ -35,7 +35,7 @@ def contents(folder):
 
 
 def environment(**more):
-    """Of a process of a trainer: this package, what else trainers import, one thread."""
+    """Environment of a trainer's process: this package, the trainer's other imports, one thread."""
     kept = {name: value for name, value in os.environ.items()
             if name not in ("PYTHONDONTWRITEBYTECODE", "DSMOE_BLEND_MODE", "DSMOE_BACKGROUND_GATE")}
     return {**kept, "PYTHONPATH": os.pathsep.join([str(PACKAGES), str(PACKAGE_PARENT)]), "OMP_NUM_THREADS": "1", **more}

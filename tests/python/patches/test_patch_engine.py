@@ -278,7 +278,7 @@ def test_the_mark_in_text_of_the_users_is_named_before_anything_is_written(tmp_p
 
 @pytest.mark.parametrize("sign", [".git", "pyproject.toml"])
 def test_another_repository_in_the_checkout_is_let_be(tmp_path, sign):
-    """Such as a clone of this package, whose files speak of the mark."""
+    """For example a clone of this package: its files name the mark."""
     make(tmp_path, {f"dsmoe/{sign}": "", "dsmoe/own.py": RENDERER, "dsmoe/patches/source.py": "x = 1  # dsmoe patch\n"})
     before = contents(tmp_path)
     assert "dsmoe/own.py" not in patches.apply(tmp_path).rules

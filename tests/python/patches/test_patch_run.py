@@ -280,7 +280,7 @@ def test_points_of_four_columns_need_what_has_absolute_gradients(columns, flavou
 
 @pytest.mark.parametrize("like_3dgs", [True, False])
 def test_the_script_that_is_run_says_which_renderer_counts(like_3dgs, tmp_path, monkeypatch):
-    """Two renderers, of which each script has one; and what the rest imports has to be there."""
+    """Each of two scripts has its own renderer; what the rest imports has to be there."""
     files = {"gaussian_renderer/a.py": RENAMED.format("diff_gaussian_rasterization", "image, radii, depth, alpha"),
              GR: "", "gaussian_renderer/b.py": RENAMED.format("diff_surfel_rasterization", "image, radii, allmap"),
              "train_a.py": "from gaussian_renderer.a import render\n", "scene/gaussian_model.py": "import utils.more\n",
@@ -362,7 +362,7 @@ print(ops.compute_relocation.__module__, ops.quat_scale_to_covar_preci.__module_
 
 @pytest.mark.parametrize("version, radii", [("1.4.0", [1, 1]), ("1.6.0+cu13", [1, 1, 2]), (None, [1, 1, 2])])
 def test_gsplat_gets_this_rasterizer_and_keeps_its_strategies(version, radii, tmp_path, python):
-    """version None: where gsplat is not installed, there is the rasterizer alone."""
+    """version None: gsplat is not installed, and only the rasterizer is there."""
     make(tmp_path, {GR: None, "x.py": CALL_GSPLAT + (CALL_STRATEGY if version else "")})
     installed = tmp_path / "installed"
     for name, text in GSPLAT.items() if version else ():
@@ -470,7 +470,7 @@ def test_sparse_adam_is_offered_to_what_was_written_for_it(files, words, is_offe
 
 
 def test_rasterizers_of_one_name_are_named(tmp_path):
-    """op43dgs, of which one is installed."""
+    """op43dgs has two rasterizers of one name; only one is installed."""
     make(tmp_path, {f"submodules/{lens}/diff_gaussian_rasterization/__init__.py": "" for lens in ("fish", "pinhole")})
     words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
     assert "warning: the checkout has fish, pinhole, all called" in run.prepare(*words)[1][1]

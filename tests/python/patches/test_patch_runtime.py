@@ -217,7 +217,7 @@ def test_a_renderer_with_another_rasterizer_is_refused(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "gaussian_renderer", theirs)
     with pytest.raises(RuntimeError, match="another rasterizer.*dsmoe patch check PATH"):
         runtime.blend_of(run("smoe"))
-    with pytest.raises(RuntimeError, match="another rasterizer"):  # arguments/ alone is patched: no blend_of is called
+    with pytest.raises(RuntimeError, match="another rasterizer"):  # only arguments/ is patched: no blend_of is called
         runtime.default_blend()
     ours = SimpleNamespace(GaussianRasterizationSettings=GaussianRasterizationSettings)
     for renderer in (ours, SimpleNamespace()):
@@ -226,7 +226,7 @@ def test_a_renderer_with_another_rasterizer_is_refused(monkeypatch, tmp_path):
 
 
 def test_a_script_that_says_no_blend_mode_is_told_how():
-    """Of the user's own, which calls the patched renderer."""
+    """The user's own script, which calls the patched renderer."""
     assert runtime.chosen_blend(SimpleNamespace(blend=ALPHA)) == ALPHA
     with pytest.raises(RuntimeError, match="needs the statements `from .* import saved_blend_of` and `pipe.blend"):
         runtime.chosen_blend(SimpleNamespace(debug=False))

@@ -89,7 +89,7 @@ def test_what_the_kernel_does_not_have_is_computed_as_before(fused_calls):
     lambda img1, img2: ssim(img1, img2, size_average=False),
     lambda img1, img2: ssim(img1.unflatten(-1, (4, -1)).flatten(-2), img2),  # takes no such width
     lambda img1, img2: ssim(img1.detach(), img2) + 0 * img1.mean(), lambda img1, img2: ssim(img1, img2) * math.nan,
-    lambda img1, img2: ssim(img1, img2) + 0 * (img1 - img1.detach()).sqrt().sum()])  # its gradient alone is NaN
+    lambda img1, img2: ssim(img1, img2) + 0 * (img1 - img1.detach()).sqrt().sum()])  # only its gradient is NaN
 def test_another_ssim_stays_and_that_is_said_once(other, capsys):
     runtime.say.cache_clear()
     call = partial(fuse.fused_where_equal, other, {})

@@ -204,5 +204,5 @@ def test_a_renderer_in_another_file_is_named(renderer, tmp_path):
     """Not that nothing imports a rasterizer."""
     make(tmp_path, {GR: renderer, "draw/other.py": RENDERER, "train_1.py": TRAIN + "if __name__ == '__main__': 0\n",
                     "train.py": TRAIN.replace("gaussian_renderer", "draw.other")})
-    refused(tmp_path, "the rasterizer, but draw/other.py, and a patch is of gaussian_renderer/__init__.py alone: type "
+    refused(tmp_path, "the rasterizer, but draw/other.py, and a patch is only of gaussian_renderer/__init__.py: type "
                       "`dsmoe run --blend-mode smoe -- python train_1.py ...`")

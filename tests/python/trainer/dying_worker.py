@@ -1,4 +1,4 @@
-"""`dsmoe` as one of torchrun's processes, of which the second dies in a step: DYING_AT says in which iteration."""
+"""`dsmoe` as one process of torchrun. The second process dies in the iteration that DYING_AT names."""
 from __future__ import annotations
 
 import os

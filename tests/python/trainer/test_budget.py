@@ -109,7 +109,7 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, strategy, kille
 
 
 def looking(trainer, monkeypatch):
-    """The strategy after steps over every training view, none of which has changed a Gaussian."""
+    """The strategy after steps over every training view that changed no Gaussian."""
     monkeypatch.setattr(trainer.strategy, "_looks", lambda step: True)
     monkeypatch.setattr(trainer.strategy, "after_backward", lambda step: None)
     monkeypatch.setattr(trainer.optimizer, "step", lambda: None)

@@ -197,4 +197,4 @@ def test_without_opencv_it_is_named(tmp_path, monkeypatch):
     assert "pip install opencv-python-headless" in str(error.value)
     shutil.rmtree(tmp_path / "sparse")
     write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, 0, 0, 0, 0], Image.new("RGB", (WIDTH, HEIGHT)))
-    assert load(folder).note == "", "with coefficients of 0 nothing is to be done"
+    assert load(folder).note == "", "with coefficients of 0 nothing has to be undistorted"

@@ -35,7 +35,7 @@ def scene(tiny_config):
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_the_first_steps_are_those_of_the_cpu(tiny_config, scene, mode):
-    """Until something is densified or pruned, rounding alone differs."""
+    """Until something is densified or pruned, only rounding differs."""
     config = tiny_config.changed(blend_mode=mode, densify_until_iter=0)
     trainers = [Trainer(dataclasses.replace(config, device=device), scene) for device in ("cpu", "cuda")]
     for _ in range(5):

@@ -51,7 +51,7 @@ def assert_equal(one, other):
     dict(blend_mode="alpha", strategy="steady", sh_degree=0),
     dict(blend_mode="smoe", strategy="importance", budget=60)], ids=str)
 def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
-    """Densifications are at 8, 16, 24; an opacity reset alone, at 12, replaces one parameter of all."""
+    """Densifications are at 8, 16, 24; an opacity reset without one, at 12, replaces only the opacities."""
     config = tiny_config.changed(**options)
     trainers = [trained(config, scene, direct) for direct in (False, True)]
     assert [type(trainer.passes) for trainer in trainers] == [AutogradPasses, DirectPasses]

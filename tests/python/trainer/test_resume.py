@@ -511,7 +511,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     with pytest.raises(OSError, match=f"disk full: '{path}'"):
         files.write_atomically(path, fails)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # as a full disk, of which torch has its own error
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # like a full disk; torch has its own error for that
     try:
         with pytest.raises(OSError, match=f"File too large: '{path}'"):
             save_checkpoint(path, {"tensor": torch.ones(10_000)})

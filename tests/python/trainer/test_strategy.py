@@ -1,4 +1,4 @@
-"""Densification as 3DGS runs it: who is cloned, split, pruned, reset, and what Adam remembers of whom."""
+"""Densification as 3DGS runs it: which Gaussians are cloned, split, pruned or reset, and their Adam state."""
 from __future__ import annotations
 
 import math
