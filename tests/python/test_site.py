@@ -1,4 +1,4 @@
-"""The pages for users: every link leads somewhere, and the documentation site builds without a warning."""
+"""The pages for users: links, commands, the README's program, and a documentation site without a warning."""
 from __future__ import annotations
 
 import importlib.util
@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -81,3 +82,16 @@ def test_the_site_builds_without_a_warning(stage, tmp_path):
     assert 'id="diff_smoe_rasterization.rasterizer.rasterize"' in python and "may exceed 1" in python
     loaded = re.findall(r'(?:src|href)="(https?:[^"]*\.(?:js|css|woff2?))', python)
     assert not loaded, "nothing is loaded from elsewhere"
+
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+def test_the_program_runs():
+    program, = re.findall(r"^```python\n(.*?)^```$", README.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    torch.manual_seed(0)
+    variables = {}
+    exec(program, variables)
+    assert variables["color"].shape == (3, 240, 320) and variables["color"].max() > 0.1
+    assert (variables["radii"] > 0).any() and variables["radii"].shape == (1000,)
+    assert variables["means3D"].grad.any() and variables["means2D"].grad.any()

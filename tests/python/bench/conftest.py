@@ -8,7 +8,7 @@ from bench_commands import tiny_suite
 from tiny_scene import one_thread, tiny_scene  # noqa: F401
 
 LACKING = [name for name in ("yaml", "pydantic", "jinja2", "matplotlib") if importlib.util.find_spec(name) is None]
-WITHOUT_THEM = ("test_lpips", "test_measure")
+WITHOUT_THEM = ("test_measure",)
 sys.path.append(str(Path(__file__).resolve().parents[1] / "patches"))  # the small trainer of those tests
 
 

@@ -192,7 +192,7 @@ def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
     ("3dgs-2023", {"protocol": {"principal_point": "scene"}}, "principal_point"),
     ("3dgs-2023", {"protocol": {"scale_recipe": True}}, "protocol"),
     ("3dgs-2023", {"protocol": {"options": {"sh_degree_interval": 500}}}, "protocol"),
-    ("3dgs-2023", {"protocol": {"device": "cpu"}}, "trains on CUDA"),
+    ("3dgs-2023", {"protocol": {"device": "cpu"}}, "trains only on CUDA"),
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "background": "white"}], "strategies": ["steady"]},
      "lego is white"),
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "init_points": 10}]}, "3dgs-2023: init_points is 10"),
