@@ -3,7 +3,8 @@
 #pragma once
 
 #define PY_SSIZE_T_CLEAN
-#ifndef Py_LIMITED_API
+#include <pyconfig.h>
+#if !defined(Py_LIMITED_API) && !defined(Py_GIL_DISABLED)  // the free-threaded Python has no limited API
 #define Py_LIMITED_API 0x03080000
 #endif
 #include <Python.h>
