@@ -229,6 +229,8 @@ template <class Frame> void refuse_walk(const char* function, const Frame& frame
   refuse_null(function, "saved.projected", frame.saved.projected, "[N]", count);
   refuse_null(function, "saved.tile_offsets", frame.saved.tile_offsets, "[tiles + 1]", 1);
   refuse_null(function, "saved.last_contributor", frame.saved.last_contributor, "[H, W]", 1);
+  // Its sign says which pairs count.
+  refuse_null(function, "saved.final_transmittance", frame.saved.final_transmittance, "[H, W]", 1);
   bool reads_radii = true;
   if constexpr (kOnHost<Frame>) {
     reads_radii = frame.saved.instances == nullptr;
@@ -272,7 +274,6 @@ void refuse_importance(const char* function, const Frame& frame, const Importanc
   refuse_instance_sums(function, frame);
   refuse_footprints(function, frame);
   refuse_null(function, "background", frame.config.background, "[C]", 1);
-  refuse_null(function, "saved.final_transmittance", frame.saved.final_transmittance, "[H, W]", 1);
   refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", 1);
   refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", has_tails(frame.config.blend.mode));
   refuse_null(function, "color", map.color, "[C, H, W]", 1);

@@ -13,7 +13,7 @@ constexpr float kGateCut = 1e-5f;           // `smoe_eq7` and the ablations skip
 constexpr float kStrongAlpha = 1.0f / 2040.0f;
 constexpr float kTailAlpha = 0x1p-35f;
 // Faint pairs and tails count where the gate sum of the near pairs is below this, unless a caller says otherwise. With
-// more, such a pair moves a pixel by less than 1 / 255 of it, about what `alpha` mode's own cut allows.
+// more, such a pair moves a pixel by less than 1 / 255 divided by this, about what `alpha` mode's own cut allows.
 constexpr float kFaintBelow = 0.9f;
 constexpr float kFaintEverywhere = 2.0f;  // no gate sum of a mode that has faint pairs is above 1
 // exp(-4.5), G at 3 sigma. Under a background gate lambda a pair changes a pixel by at most alpha / lambda. So pairs

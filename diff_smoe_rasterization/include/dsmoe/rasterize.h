@@ -106,9 +106,8 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times = nullptr);
 template <class S> void blend(const Frame<S>& frame, StageTimes* times = nullptr);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say. Of the frame it reads the number of
-// Gaussians and the image's size; of config the mode, alpha_min, the background's gate, num_threads and most_instances;
-// of saved all but features, final_transmittance, sums, gate_sum and tails; and of images the radii, where no lists are
-// kept.
+// Gaussians and the image's size; of config the blend's rules, num_threads and most_instances; of saved all
+// but features, sums, gate_sum and tails; and of images the radii, where no lists are kept.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map);
 
 // Walks the tile lists once more, and sums what each Gaussian is worth to the image. `frame` is as `forward` left it;

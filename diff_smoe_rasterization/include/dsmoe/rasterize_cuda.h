@@ -250,9 +250,9 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
 // may differ in their last digits from call to call, unless work.deterministic is set. Then it walks twice, and takes
-// 36 bytes more for each Gaussian. Of the frame it reads the number of Gaussians, the image's size, of config the mode,
-// alpha_min, the background's gate and most_instances, of images the radii, and of saved neither features nor images
-// but last_contributor. work.scratch is needed, here and in the next two.
+// 36 bytes more for each Gaussian. Of the frame it reads the number of Gaussians, the image's size, of config the
+// blend's rules and most_instances, of images the radii, and of saved all but features, segments, sums, gate_sum and
+// tails. work.scratch is needed, here and in the next two.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
 // Walks the tile lists once more, and sums what each Gaussian is worth to the image, by atomics as `contributions`.
