@@ -218,12 +218,12 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
     """Returns the gate sum of near pairs below which a rendering in this blend mode counts faint pairs and tails.
 
-    Raises ValueError for a number that is negative or NaN.
+    Raises ValueError for what is no finite number of 0 or more.
     """
     if faint_below is None:
         return _FAINT_BELOW.get(blend_mode, 2.0)
-    if not faint_below >= 0:
-        raise ValueError(f"faint_below is {faint_below!r}; it must be 0 or more")
+    if isinstance(faint_below, str) or not 0 <= faint_below < math.inf:
+        raise ValueError(f"faint_below is {faint_below!r}; it must be a finite number of 0 or more, or None")
     return float(faint_below)
 
 

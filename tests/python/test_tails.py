@@ -199,7 +199,8 @@ def test_gradients_hold_the_tails_constant():
     assert (plain["opacities"] - actual["opacities"]).abs().max() > 1e-3
 
 
-def test_refuses_a_faint_below_that_is_negative():
-    scene = random_scene("smoe", 3).with_settings(faint_below=-1.0)
-    with pytest.raises(ValueError, match="faint_below is -1.0; it must be 0 or more"):
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), "0.9"])
+def test_refuses_what_is_no_faint_below(value):
+    scene = random_scene("smoe", 3).with_settings(faint_below=value)
+    with pytest.raises(ValueError, match=f"faint_below is {value!r}; it must be a finite number of 0 or more, or None"):
         rasterize(settings=scene.settings, **scene.inputs)
