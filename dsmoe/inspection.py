@@ -21,7 +21,7 @@ from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
 from .results.video import check_folder
 from .scenes.cameras import Camera
-from .scenes.scene import Scene, load_cameras, load_scene, scene_fingerprint
+from .scenes.scene import Scene, difference_of, load_cameras, load_scene
 from .system.device import check_device
 from .system.files import write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
@@ -109,12 +109,11 @@ def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
             recorded = dict(load_checkpoint(path, "cpu")["scene"])
     except TrainerError as error:
         return f"note: whether {config.scene} is the scene that the run was trained on is not known: {error}", False
-    for name, here in scene_fingerprint(scene).items():
-        there = recorded.get(name, here)  # earlier versions recorded fewer of them
-        if there != here:
-            return (f"note: {config.scene} is not the scene that {config.output} was trained on: {name} {there} there "
-                    f"and {here} here; {RESULTS_NAME} stays"), True
-    return "", False
+    difference = difference_of(scene, recorded)
+    if not difference:
+        return "", False
+    return (f"note: {config.scene} is not the scene that {config.output} was trained on: {difference} here; "
+            f"{RESULTS_NAME} stays"), True
 
 
 def _is_of(row: Dict[str, Any], config: TrainConfig) -> bool:

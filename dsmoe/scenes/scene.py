@@ -10,7 +10,7 @@ import dataclasses
 import hashlib
 import os
 from dataclasses import dataclass
-from typing import Any, Dict, Iterable, List, Optional, Sequence
+from typing import Any, Dict, Iterable, List, Mapping, Optional, Sequence
 
 import numpy as np
 
@@ -126,6 +126,15 @@ def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
         "checksum of the training images": files(scene.train),
         "checksum of the test images": files(scene.test),
     }
+
+
+def difference_of(scene: Scene, recorded: Mapping[str, Any]) -> str:
+    """The first difference from a recorded `scene_fingerprint`, as "NAME X there and Y"; "" where there is none."""
+    for name, here in scene_fingerprint(scene).items():
+        there = recorded.get(name, here)  # earlier versions recorded fewer of them
+        if here != there:
+            return f"{name} {there} there and {here}"
+    return ""
 
 
 def _pose(camera: Camera, extent: float) -> bytes:

@@ -15,7 +15,7 @@ from ..results.evaluation import Evaluation, evaluate
 from ..results.metrics import psnr
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..scenes.images import View
-from ..scenes.scene import Scene, scene_fingerprint
+from ..scenes.scene import Scene, difference_of, scene_fingerprint
 from ..system.group import ALONE
 from ..system.stopwatch import Stopwatch
 from .background_gate import LearnedGate
@@ -189,11 +189,9 @@ class Trainer:
         differences = TrainConfig.of_record(state["config"]).differences(self.config)
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
-        for name, here in scene_fingerprint(self.scene).items():
-            there = state["scene"].get(name, here)  # earlier versions recorded fewer of them
-            if here != there:
-                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
-                                   f"and {here} in {self.config.scene}")
+        difference = difference_of(self.scene, state["scene"])
+        if difference:
+            raise TrainerError(f"the checkpoint is of a run on another scene: {difference} in {self.config.scene}")
         check_state(state, self.config, self.strategy.state_dict(), self.order.count)
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
