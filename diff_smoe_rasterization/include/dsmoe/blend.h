@@ -224,37 +224,27 @@ template <> struct Blend<BlendMode::kSmoeStd> : GateBlend<false, false> {
   static constexpr Law kLaw = Law::kGates;
 };
 
-// Facts of a mode that is known at run time.
+// What fact(Blend<mode>()) says of a mode that is known at run time; `otherwise` where there is no such mode.
+template <class T, class Fact> DSMOE_HD constexpr T fact_of(BlendMode mode, T otherwise, Fact fact) {
+  T found = otherwise;
+  BlendModes::for_each(
+      [&](auto of) { found = decltype(of)::value == mode ? fact(Blend<decltype(of)::value>()) : found; });
+  return found;
+}
 DSMOE_HD constexpr Cut cut_of(BlendMode mode) {
-  Cut cut = Cut::kKernel;
-  BlendModes::for_each([&](auto of) { cut = decltype(of)::value == mode ? Blend<decltype(of)::value>::kCut : cut; });
-  return cut;
+  return fact_of(mode, Cut::kKernel, [](auto blend) { return decltype(blend)::kCut; });
 }
 DSMOE_HD constexpr bool within_radius(BlendMode mode) {
-  bool within = false;
-  BlendModes::for_each(
-      [&](auto of) { within |= decltype(of)::value == mode && Blend<decltype(of)::value>::kWithinRadius; });
-  return within;
+  return fact_of(mode, false, [](auto blend) { return decltype(blend)::kWithinRadius; });
 }
-
 DSMOE_HD constexpr bool has_tails(BlendMode mode) {
-  bool tails = false;
-  BlendModes::for_each([&](auto of) { tails |= decltype(of)::value == mode && Blend<decltype(of)::value>::kTails; });
-  return tails;
+  return fact_of(mode, false, [](auto blend) { return decltype(blend)::kTails; });
 }
-
 DSMOE_HD constexpr bool near_first(BlendMode mode) {
-  bool first = false;
-  BlendModes::for_each(
-      [&](auto of) { first |= decltype(of)::value == mode && Blend<decltype(of)::value>::kNearFirst; });
-  return first;
+  return fact_of(mode, false, [](auto blend) { return decltype(blend)::kNearFirst; });
 }
-
 DSMOE_HD constexpr float faint_below_of(BlendMode mode) {
-  float below = kFaintEverywhere;
-  BlendModes::for_each(
-      [&](auto of) { below = decltype(of)::value == mode ? Blend<decltype(of)::value>::kFaintBelow : below; });
-  return below;
+  return fact_of(mode, kFaintEverywhere, [](auto blend) { return decltype(blend)::kFaintBelow; });
 }
 
 // Adds a pair to the sum of a pixel's tails, B, where it is a tail and the pixel is open. state: of the pixel in front
