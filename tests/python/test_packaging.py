@@ -145,6 +145,32 @@ def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, capsys,
         assert runs_on(capability, flags), capability
 
 
+def test_cmake_is_told_what_torch_and_the_environment_say(tmp_path, monkeypatch):
+    folder, nvcc = toolkit(tmp_path, "12.8", 80, 90)
+    setup = load_setup()
+    tools = SimpleNamespace(**{**vars(setup.import_build_tools()[1]), "CUDA_HOME": folder})
+
+    def options(release, cxx11_abi, with_cuda=True):
+        fake = SimpleNamespace(**{**vars(torch_of("12.8")), "__version__": release,
+                                  "compiled_with_cxx11_abi": lambda: cxx11_abi})
+        return setup.options_of_cmake(fake, tools, with_cuda=with_cuda, stable=False)
+
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("DSMOE_CORE_FOLDER", str(tmp_path))
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6")
+    told = options("2.13.0+cu128", True)
+    assert (told["DSMOE_CXX_STANDARD"], told["DSMOE_CORE_FOLDER"]) == (20, str(tmp_path))
+    assert told["CMAKE_CUDA_COMPILER"] == nvcc and "CMAKE_CUDA_HOST_COMPILER" not in told
+    assert told["CMAKE_CUDA_FLAGS"] == "-gencode=arch=compute_86,code=sm_86"
+    monkeypatch.setenv("CC", "gcc-12")
+    monkeypatch.delenv("TORCH_CUDA_ARCH_LIST")
+    monkeypatch.setenv("DSMOE_CUDA_ARCH", "usual")
+    told = options("1.13.0a0", False)
+    assert (told["DSMOE_CXX_STANDARD"], told["DSMOE_CORE_FOLDER"], told["DSMOE_CXX11_ABI"]) == (17, "", 0)
+    assert told["CMAKE_CUDA_HOST_COMPILER"] == "gcc-12" and "code=compute_90" in told["CMAKE_CUDA_FLAGS"]
+    assert not [name for name in options("2.4.1", False, with_cuda=False) if "CMAKE_CUDA" in name]
+
+
 @pytest.mark.parametrize("torch_cuda, built", [("12.8", True), ("12.1", True), ("11.8", False), (None, False)])
 def test_cuda_is_built_where_torch_and_the_toolkit_fit(tmp_path, monkeypatch, torch_cuda, built):
     monkeypatch.setenv("DSMOE_BUILD_CUDA", "auto")
