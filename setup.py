@@ -1,26 +1,25 @@
-"""Builds libdsmoe.so, which needs no Python, and the extension _C over it. Metadata: pyproject.toml; files and compiler
-flags: sources.txt.
+"""Builds libdsmoe.so, which needs no Python, and the extension _C over it, by CMake: csrc/python/CMakeLists.txt.
 
-Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA; unset: where also a GPU is seen, or
-cards are named), TORCH_CUDA_ARCH_LIST, MAX_JOBS; DSMOE_CUDA_ARCH=all compiles for every card where none is seen;
-DSMOE_CORE_FOLDER=DIR links the libraries that CMake has built in DIR (libdsmoe_core.a, libdsmoe_io.a, libdsmoe_cuda.a)
-in place of compiling their sources once more; DSMOE_STABLE_ABI=1 makes _C by LibTorch's stable ABI and Python's limited
-API: it loads with every PyTorch from 2.11 on, and libdsmoe.so has no ops for C++.
+Metadata: pyproject.toml. Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA; unset:
+where also a GPU is seen, or cards are named), TORCH_CUDA_ARCH_LIST, MAX_JOBS; DSMOE_CUDA_ARCH=all compiles for every
+card where none is seen; DSMOE_CORE_FOLDER=DIR links the libraries that CMake has built in DIR (libdsmoe_core.a,
+libdsmoe_io.a, libdsmoe_cuda.a) in place of compiling their sources once more; DSMOE_STABLE_ABI=1 makes _C by LibTorch's
+stable ABI and Python's limited API: it loads with every PyTorch from 2.11 on, and libdsmoe.so has no ops for C++.
 """
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
-from collections import defaultdict
+import sysconfig
 from pathlib import Path
 
 import setuptools
+from setuptools.command.build_ext import build_ext
 
 ROOT = Path(__file__).resolve().parent
 PACKAGE = "diff_smoe_rasterization"
-LIBRARY = "libdsmoe"
-# Where a C++ program finds what libdsmoe.so needs. Python has loaded it before.
-LIBRARY_PATHS = ("$ORIGIN/../torch/lib", "$ORIGIN/../nvidia/cu13/lib", "$ORIGIN/../nvidia/cuda_runtime/lib")
 # What is compiled for where no card is seen. A kernel runs on later cards of the same major number too; cards after the
 # last compile its PTX when they first run it. EVERY_CARD: what torch's own builds are for, and 11.0. The usual ones are
 # the oldest that the toolkit knows, for its major number, and these.
@@ -28,19 +27,9 @@ EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
 USUAL_CARDS = (80, 90)
 # On one core of an AMD EPYC; a kernel's file for the usual cards.
 SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
-# The oldest PyTorch whose stable ABI has what the ops take, and the oldest Python that it supports.
-STABLE_ABI_SINCE, STABLE_PYTHON = "2.11", "cp310"
+# The oldest PyTorch whose stable ABI has what the ops take, as its headers write it, and the oldest Python of that one.
+STABLE_ABI_SINCE, TORCH_TARGET_VERSION, STABLE_PYTHON = "2.11", "0x020b000000000000", "cp310"
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
-
-
-def read_sources():
-    """Returns {group: [word, ...]} of sources.txt."""
-    groups = defaultdict(list)
-    for line in (ROOT / "sources.txt").read_text().splitlines():
-        words = line.partition("#")[0].split()
-        if words:
-            groups[words[0]] += words[1:]
-    return groups
 
 
 def import_build_tools():
@@ -51,7 +40,7 @@ def import_build_tools():
         sys.exit(
             f"{PACKAGE} compiles against PyTorch, which this Python ({sys.executable}) cannot import: {error}\n"
             "Install it first, then build against it:\n"
-            "    pip install torch setuptools wheel ninja\n"
+            "    pip install torch setuptools wheel cmake ninja\n"
             "    pip install --no-build-isolation ."
         )
     try:
@@ -78,7 +67,7 @@ def answer(*command):
     return subprocess.run(command, stdout=subprocess.PIPE, check=True, universal_newlines=True).stdout
 
 
-def reasons_against_cuda(cuda_sources, torch, cuda_home):
+def reasons_against_cuda(torch, cuda_home):
     """Returns why the CUDA backend is not built, as a list; empty where it is."""
     wish = os.environ.get("DSMOE_BUILD_CUDA", "")
     if wish not in ("", "auto", "0", "1"):
@@ -86,8 +75,6 @@ def reasons_against_cuda(cuda_sources, torch, cuda_home):
     if wish == "0":
         return ["it was built with DSMOE_BUILD_CUDA=0"]
     reasons = []
-    if not cuda_sources:
-        reasons.append("this version has no CUDA backend")
     if torch.version.cuda is None:
         reasons.append(f"torch {torch.__version__} is a build without CUDA")
     nvcc = nvcc_of(cuda_home)
@@ -105,13 +92,16 @@ def reasons_against_cuda(cuda_sources, torch, cuda_home):
     return reasons
 
 
+def jobs():
+    return int(os.environ.get("MAX_JOBS") or os.cpu_count() or 1)
+
+
 def announcement(sources, without_cuda):
     """What is compiled, and about how long that takes at most: where some of it has been compiled before, less."""
-    jobs = int(os.environ.get("MAX_JOBS") or os.cpu_count() or 1)
-    seconds = sum(SECONDS_OF_A_KERNEL if path.endswith(".cu") else SECONDS_OF_A_FILE for path in sources) / jobs
+    seconds = sum(SECONDS_OF_A_KERNEL if path.endswith(".cu") else SECONDS_OF_A_FILE for path in sources) / jobs()
     why = "; ".join(without_cuda)
     target = "for the CPU" if why else "for CPU and GPU"
-    return (f"{PACKAGE}: compiling {len(sources)} files, {jobs} at once, {target}: "
+    return (f"{PACKAGE}: compiling {len(sources)} files, {jobs()} at once, {target}: "
             f"about {max(1, round(seconds / 60))} min" + (f" (without CUDA: {why})" if why else ""))
 
 
@@ -147,65 +137,63 @@ def architecture_flags(nvcc, torch):
     return [f"-gencode=arch=compute_{number},code={kind}" for number, kind in kinds]
 
 
-def compiled_libraries(torch):
-    """Returns the libraries that CMake has built, by the group of sources.txt that each holds, in the order of linking.
+def options_of_cmake(torch, cpp_extension, with_cuda, stable):
+    """Returns what CMakeLists.txt asks: this Python, this PyTorch, and for which cards, as {name: value}."""
+    release = tuple(int(number) for number in torch.__version__.split(".")[:2])
+    core = os.environ.get("DSMOE_CORE_FOLDER") if torch.compiled_with_cxx11_abi() else None  # it has the newer ABI
+    includes = cpp_extension.include_paths() + [sysconfig.get_path(name) for name in ("include", "platinclude")]
+    options = {
+        "DSMOE_PYTHON": "ON",
+        "DSMOE_BUILD_TESTS": "OFF",
+        "DSMOE_BUILD_TOOLS": "OFF",
+        "DSMOE_CUDA": "ON" if with_cuda else "OFF",
+        "DSMOE_STABLE_ABI": TORCH_TARGET_VERSION if stable else "OFF",
+        "DSMOE_CXX11_ABI": int(torch.compiled_with_cxx11_abi()),
+        "DSMOE_CXX_STANDARD": 17 if release < (2, 13) else 20,
+        "DSMOE_INCLUDES": ";".join(includes),
+        "DSMOE_LIBRARY_FOLDERS": ";".join(cpp_extension.library_paths()),
+        "DSMOE_CORE_FOLDER": os.path.abspath(core) if core else "",
+    }
+    if with_cuda:
+        nvcc = nvcc_of(cpp_extension.CUDA_HOME)
+        options["CMAKE_CUDA_COMPILER"] = nvcc
+        options["CMAKE_CUDA_FLAGS"] = " ".join(architecture_flags(nvcc, torch) or cpp_extension._get_cuda_arch_flags())
+        options["CMAKE_CUDA_ARCHITECTURES"] = "OFF"  # the flags have them
+        if os.environ.get("CC"):
+            options["CMAKE_CUDA_HOST_COMPILER"] = os.environ["CC"]
+    return options
 
-    Empty where all is compiled here. Torch releases of the older C++ ABI cannot link them.
-    """
-    folder = os.environ.get("DSMOE_CORE_FOLDER")
-    if not folder or not torch.compiled_with_cxx11_abi():
-        return {}
-    paths = {group: Path(folder) / f"libdsmoe_{group}.a" for group in ("cuda", "core", "io")}
-    return {group: str(path) for group, path in paths.items() if path.is_file()}
+
+def find_program(name):
+    """Returns the path of a program, or None. That of this Python's environment need not be active."""
+    return shutil.which(name) or shutil.which(name, path=os.path.dirname(sys.executable))
+
+
+def run_cmake(*words):
+    cmake = find_program("cmake")
+    if cmake is None:
+        sys.exit(f"{PACKAGE} is built by CMake (3.21 or later), which is not installed; type: pip install cmake")
+    if subprocess.run([cmake, *map(str, words)]).returncode != 0:
+        sys.exit(f"CMake could not build {PACKAGE}; the lines above say why")
+
+
+def configure(folder, options):
+    """Configures a build in `folder`, where an earlier one has left its objects; returns the files that it compiles."""
+    ninja = find_program("ninja")
+    generator = ["-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={ninja}"] if ninja else ["-G", "Unix Makefiles"]
+    if (folder / "CMakeCache.txt").exists():
+        (folder / "CMakeCache.txt").unlink()  # may name programs of an environment that pip has removed
+    run_cmake("-S", ROOT, "-B", folder, *generator, "-DCMAKE_EXPORT_COMPILE_COMMANDS=ON",
+              *(f"-D{name}={value}" for name, value in options.items()))
+    return [entry["file"] for entry in json.loads((folder / "compile_commands.json").read_text())]
 
 
 def extension():
     """Returns the arguments of setup() that build libdsmoe.so and `diff_smoe_rasterization._C`."""
     torch, cpp_extension = import_build_tools()
-    sources = read_sources()
-    without_cuda = reasons_against_cuda(sources["cuda"], torch, cpp_extension.CUDA_HOME)
+    without_cuda = reasons_against_cuda(torch, cpp_extension.CUDA_HOME)
     stable = os.environ.get("DSMOE_STABLE_ABI", "0") == "1"
-    ops = ["torch", "stable_abi" if stable else "torch_cpp"] + ([] if without_cuda else ["torch_cuda"])
-    groups = ["core", "io"] + ([] if without_cuda else ["cuda"]) + ([] if stable else ops)
-    libraries = {group: path for group, path in compiled_libraries(torch).items() if group in groups}
-    if stable:
-        libraries.pop("io", None)  # torch builds no library of no source
-    flags = sources["flags"] + ["-g0", "-pthread"]
-    if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
-        flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
-    nvcc_flags = ["-O3"]
-    if not without_cuda:
-        nvcc_flags += architecture_flags(nvcc_of(cpp_extension.CUDA_HOME), torch)
-    folders = [str(ROOT / PACKAGE / folder) for folder in ("include", "csrc")]
-    make = cpp_extension.CppExtension if without_cuda else cpp_extension.CUDAExtension
-    library = make(
-        f"{PACKAGE}.{LIBRARY}",
-        [f"{PACKAGE}/{path}" for group in groups if group not in libraries for path in sources[group]],
-        include_dirs=folders,
-        # C++ programs that link the library call what it exports; calls inside need not go through the table for that.
-        extra_compile_args={"cxx": flags + ["-fno-semantic-interposition"], "nvcc": nvcc_flags},
-        extra_link_args=["-pthread", f"-Wl,-soname,{LIBRARY}.so", *(f"-Wl,-rpath,{path}" for path in LIBRARY_PATHS),
-                         "-Wl,--whole-archive", *libraries.values(), "-Wl,--no-whole-archive"],
-    )
-    library.libraries.remove("torch_python")
-    macros = [] if without_cuda else [("DSMOE_WITH_CUDA", None)]
-    if stable:
-        major, minor = map(int, STABLE_ABI_SINCE.split("."))
-        macros += [("DSMOE_STABLE_ABI", None), ("TORCH_TARGET_VERSION", f"0x{major:02x}{minor:02x}000000000000")]
-        # With its own CUDA runtime it needs none of PyTorch's libraries.
-        library.libraries = [] if without_cuda else ["cudart_static", "dl", "rt"]
-        macros += [] if without_cuda else [("USE_CUDA", None)]  # by which PyTorch declares its functions of CUDA
-    module = (make if stable else cpp_extension.CppExtension)(
-        f"{PACKAGE}._C",
-        [f"{PACKAGE}/{path}" for group in ["python"] + (ops if stable else []) for path in sources[group]],
-        include_dirs=folders,
-        define_macros=macros,
-        extra_compile_args={"cxx": flags + ["-fvisibility=hidden"]},
-        extra_link_args=["-Wl,-rpath,$ORIGIN"],
-        py_limited_api=stable,
-    )
-    if stable:
-        module.libraries = ["torch_cpu"]
+    module = setuptools.Extension(f"{PACKAGE}._C", [], py_limited_api=stable)
     built_against = {
         "TORCH_VERSION": torch.__version__,
         "CUDA_VERSION": None if without_cuda else torch.version.cuda,
@@ -215,23 +203,24 @@ def extension():
         "COMMIT": commit(),
     }
 
-    class BuildExtension(cpp_extension.BuildExtension):
+    class BuildExtension(build_ext):
         def run(self):
-            tell(announcement(library.sources + module.sources, without_cuda))
-            self.parallel = None  # _C links the library: one after the other, also under `build_ext -j`
-            module.extra_objects = [os.path.join(self.build_lib, self.get_ext_filename(library.name))]
-            super().run()
+            # Not in build_temp, which an editable install removes.
+            name = f"cmake-{'stable-abi' if stable else sys.implementation.cache_tag}"
+            folder = Path(self.get_finalized_command("build").build_base).resolve() / name
+            files = configure(folder, options_of_cmake(torch, cpp_extension, not without_cuda, stable))
+            tell(announcement(files, without_cuda))
+            run_cmake("--build", folder, "--parallel", jobs(), "--target", "dsmoe_package")
+            path = Path(self.get_ext_fullpath(module.name))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(folder / "package" / "_C.so", path)
+            shutil.copy2(folder / "package" / "libdsmoe.so", path.parent)
             lines = ['"""What the extension was built against; readable even where it cannot be loaded."""']
             lines += [f"{name} = {value!r}" for name, value in built_against.items()]
-            Path(self.get_ext_fullpath(module.name)).with_name("_build_info.py").write_text("\n".join(lines) + "\n")
-
-        def get_ext_filename(self, name):
-            if name.endswith(LIBRARY):  # no module: a name without the tag of a Python
-                return os.path.join(*name.split(".")) + ".so"
-            return super().get_ext_filename(name)
+            path.with_name("_build_info.py").write_text("\n".join(lines) + "\n")
 
     tag = {"options": {"bdist_wheel": {"py_limited_api": STABLE_PYTHON}}} if stable else {}
-    return {"ext_modules": [library, module], "cmdclass": {"build_ext": BuildExtension}, **tag}
+    return {"ext_modules": [module], "cmdclass": {"build_ext": BuildExtension}, **tag}
 
 
 def commit():

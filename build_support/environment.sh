@@ -70,7 +70,7 @@ fingerprint() {
   (
     cd "$root" || exit
     {
-      find setup.py pyproject.toml sources.txt build_support diff_smoe_rasterization dsmoe \
+      find setup.py pyproject.toml CMakeLists.txt build_support diff_smoe_rasterization dsmoe \
         -type f ! -name '*.py[co]' ! -name '*.so' ! -name _build_info.py -exec cksum {} + || true
       cat "$venv"/lib/python*/site-packages/torch/version.py || true
     } 2>/dev/null | LC_ALL=C sort
@@ -112,7 +112,7 @@ up_to_date() {
 
 # Makes the environment where there is none, and installs what was asked for as PyTorch.
 install_torch() {
-  local python=${DSMOE_PYTHON:-python3} over_system=()
+  local python=${DSMOE_PYTHON:-python3} over_system=() tools=("setuptools>=61,<82" wheel ninja)
   if [ -n "${DSMOE_PYTHON-}" ] && [ -x "$venv/bin/python" ] &&
     [ "$("$python" --version)" != "$("$venv/bin/python" --version)" ]; then
     fail "$venv holds $("$venv/bin/python" --version), but DSMOE_PYTHON is $("$python" --version):" \
@@ -129,9 +129,10 @@ install_torch() {
   fi
   rm -f "$stamp"
   if [ ${#torch_request[@]} -gt 0 ]; then
+    command -v cmake >/dev/null || tools+=(cmake)
     # --no-compile: Python compiles the modules that it imports, which are few of torch's.
     step "Installing PyTorch and build tools" \
-      pip_install --no-compile "${torch_request[@]}" "setuptools>=61,<82" wheel ninja
+      pip_install --no-compile "${torch_request[@]}" "${tools[@]}"
   fi
 }
 

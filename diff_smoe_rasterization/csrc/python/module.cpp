@@ -3,11 +3,11 @@
 #include "dsmoe/constants.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "dsmoe/removal.h"
-#include "io/python_bindings.h"
-#include "most_instances.h"
-#include "profiling.h"
+#include "python/io.h"
 #include "python/python.h"
-#include "tensors.h"
+#include "torch/most_instances.h"
+#include "torch/profiling.h"
+#include "torch/tensors.h"
 
 #ifdef DSMOE_STABLE_ABI
 #include <torch/headeronly/version.h>

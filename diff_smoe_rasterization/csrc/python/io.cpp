@@ -1,4 +1,4 @@
-#include "io/python_bindings.h"
+#include "python/io.h"
 
 #include <array>
 #include <cstdint>

@@ -1,4 +1,4 @@
-// The functions of this folder for Python, with numpy arrays.
+// The functions of csrc/io for Python, with numpy arrays.
 #pragma once
 
 #include "python/python.h"
