@@ -35,7 +35,7 @@ template <class S, BlendMode kBlendMode, class Pass> class PassVisitor {
       num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
       if constexpr (kSums) {
         last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
-        const State<S> state = pass_.begin(index);
+        State<S> state = pass_.begin(index);
         each_array([&](PixelArray<S> array, S number) { array.pixel(x, y) = number; }, state);
       }
     });
@@ -84,7 +84,7 @@ template <class S, BlendMode kBlendMode, class Pass> class PassVisitor {
   // Calls visit(array, number) for each number of a State.
   template <class Visit, class AnyState> DSMOE_HD void each_array(Visit visit, AnyState& state) const {
     Scratch<S> arrays = {state_.values};
-    AnyState::for_each([&](auto& number) { visit(arrays.pixels(), number); }, state);
+    state.for_each([&](auto& number) { visit(arrays.pixels(), number); });
   }
 
   const Pass& pass_;

@@ -36,9 +36,7 @@ template <class S> struct ContributionPass {
     Real weight;  // of the pixel, in the caller's map
 
     static constexpr int kNum = 1;
-    template <class Visit, class... States> static DSMOE_HD void for_each(Visit visit, States&... of) {
-      visit(of.weight...);
-    }
+    template <class Visit> DSMOE_HD void for_each(Visit visit) { visit(weight); }
   };
   template <class Real> using Sums = Contribution<Real>;
   static constexpr bool kCounts = true;

@@ -14,9 +14,7 @@ template <class S> struct GateMapPass {
     Whole<Real> count;  // pairs that contributed
 
     static constexpr int kNum = 3;
-    template <class Visit, class... States> static DSMOE_HD void for_each(Visit visit, States&... of) {
-      visit(of.greatest...), visit(of.seen...), visit(of.count...);
-    }
+    template <class Visit> DSMOE_HD void for_each(Visit visit) { visit(greatest), visit(seen), visit(count); }
   };
   template <class Real> using Sums = NoSums;
 

@@ -2,7 +2,8 @@
 // features. csrc/cpu/tile_pass_impl.h and csrc/cuda/pass.cuh have the walks. A pass is a struct of S with its maps, and
 //
 //   State<Real>    what it knows of a pixel, or of a pack of pixels; `for_each` visits its kNum numbers
-//   Sums<Real>     what it sums over the pixels of each Gaussian, likewise; or NoSums
+//   Sums<Real>     what it sums over the pixels of each Gaussian; `for_each` visits those of several side by side. Or
+//                  NoSums
 //   visit<kMode>(walked, state, pair, sums)   moves a pixel past a pair. Returns whether the pair adds to the sums
 //
 // With sums the State is what the caller's maps say of a pixel, and visits leave it as it is:
