@@ -6,8 +6,7 @@
 #include "../dispatch.h"
 #include "../refuse.h"
 #include "bands.h"
-#include "dsmoe/params.h"
-#include "dsmoe/removal.h"
+#include "dsmoe/passes/importance.h"
 #include "exact_sums.cuh"
 #include "reduce.cuh"
 #include "segments.cuh"
@@ -307,8 +306,7 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
       });
     });
   };
-  const ImportanceSums<S>& sums = map.sums;
-  sum_terms(frame, SumTargets<S>{{sums.shares, sums.squared_shares, sums.removal_costs}, 3}, work, walk);
+  sum_terms(frame, ImportancePass<S>{map}.targets(), work, walk);
 }
 
 #define DSMOE_INSTANTIATE(S) template void importance(const Frame<S>&, const ImportanceMap<S>&, const Work&);
