@@ -12,6 +12,7 @@ from typing import Dict, List, Type
 import torch
 from models import Model, mode_and_gate
 
+from diff_smoe_rasterization.settings import resolve_faint_below
 from dsmoe.scenes.cameras import Camera
 
 NEAR = 0.2
@@ -59,7 +60,7 @@ class Ours(Renderer):
     """This project, one of its blends. Also makes the gradient of means2D, as a trainer needs it."""
 
     blend = "alpha"
-    deterministic = False
+    more_settings: Dict[str, object] = {}
 
     def __init__(self, model: Model):
         from diff_smoe_rasterization import rasterize
@@ -71,20 +72,25 @@ class Ours(Renderer):
         return {**parameters, "means2D": torch.zeros_like(parameters["means3D"])}
 
     def make_view(self, model, view):
-        return model.settings(view, self.blend)._replace(deterministic=self.deterministic)
+        return model.settings(view, self.blend)._replace(**self.more_settings)
 
     def render(self, view):
         return self.rasterize(settings=view, **self.parameters).color
 
 
+# What may stand behind a blend in a renderer's name: "covered" leaves faint pairs out of covered pixels in smoe_eq7.
+MORE_SETTINGS: Dict[str, Dict[str, object]] = {
+    "": {}, "deterministic": {"deterministic": True}, "covered": {"faint_below": resolve_faint_below("smoe", None)}}
+
+
 def ours(name: str) -> Type[Ours]:
-    """Of a name such as "ours smoe:0.05 deterministic". Raises ValueError."""
+    """Of a name such as "ours smoe:0.05 deterministic" or "ours smoe_eq7 covered". Raises ValueError."""
     word, _, rest = name.partition(" ")
     blend, _, how = rest.partition(" ")
-    if word != "ours" or how not in ("", "deterministic"):
+    if word != "ours" or how not in MORE_SETTINGS:
         raise ValueError(f"{name} is no renderer")
     mode_and_gate(blend)
-    return type(name, (Ours,), {"blend": blend, "deterministic": bool(how), "is_alpha": blend == "alpha"})
+    return type(name, (Ours,), {"blend": blend, "more_settings": MORE_SETTINGS[how], "is_alpha": blend == "alpha"})
 
 
 class Inria(Renderer):

@@ -3,7 +3,7 @@
     from dsmoe import patches
     patches.apply("gaussian-splatting")        # what `dsmoe patch apply gaussian-splatting` does
 
-README.md says what is in which file.
+README.md lists the trainers and the rules of a patch.
 """
 from .engine import apply, check, diff, revert
 from .source import PatchError
