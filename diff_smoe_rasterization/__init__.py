@@ -12,7 +12,7 @@ import sys
 from typing import TYPE_CHECKING, Any, List
 
 from ._version import __version__
-from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterizationSettings, Importance, Rendering
+from .settings import BLEND_MODES, OUTPUTS, Contributions, GateMap, GaussianRasterizationSettings, Importance, Rendering
 
 _HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension", "fused_ssim": "losses",
           "distCUDA2": "neighbors", "Footprints": "footprints", "blend_footprints": "footprints",
@@ -55,7 +55,7 @@ if "torch" in sys.modules:
     except ImportError:  # not built; the first name that is used says so
         pass
 
-__all__ = ["BLEND_MODES", "Contributions", "DirectRendering", "Footprints", "FusedAdam",
+__all__ = ["BLEND_MODES", "Contributions", "DirectRendering", "Footprints", "FusedAdam", "GateMap",
            "GaussianRasterizationSettings", "GaussianRasterizer", "Importance", "LazyAdam", "OUTPUTS", "Rendering",
            "SparseGaussianAdam", "Splats", "__version__", "blend_footprints", "build_info", "distCUDA2", "fused_ssim",
            "project_gaussians", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",

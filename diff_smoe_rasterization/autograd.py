@@ -192,6 +192,11 @@ def _fake_importance(pixel_weights, share_weights, color, gate_sum, bg, radii, *
     return tuple(pixel_weights.new_empty(radii.shape) for _ in range(3))
 
 
+def _fake_gate_map(radii, saved, background_gate, *options):
+    given = dict(zip(OPTIONS, options))
+    return tuple(radii.new_empty((given["image_height"], given["image_width"])) for _ in range(2))
+
+
 if _CAN_REGISTER:
     _NAME = "diff_smoe_rasterization::"
     torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
@@ -202,5 +207,6 @@ if _CAN_REGISTER:
     torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
     torch.library.register_fake(_NAME + "contributions", _fake_contributions)
     torch.library.register_fake(_NAME + "importance", _fake_importance)
+    torch.library.register_fake(_NAME + "gate_map", _fake_gate_map)
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
     torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)

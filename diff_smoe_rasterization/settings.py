@@ -135,6 +135,13 @@ class Importance(NamedTuple):
     removal_costs: torch.Tensor  # [N] sum e |C' - C|^2, over all channels; C' is the pixel without the Gaussian
 
 
+class GateMap(NamedTuple):
+    """Which Gaussians have a part in each pixel: what `Splats.gate_map` returns."""
+
+    gaussians: torch.Tensor  # [H, W] int32; of the largest weight in the numerator, the nearest of equal ones; -1: none
+    counts: torch.Tensor  # [H, W] int32, how many Gaussians the numerator has
+
+
 FEATURE_OUTPUTS = ("depth", "inverse_depth")  # images of the op on request, in its order
 OUTPUTS = ("alpha", *FEATURE_OUTPUTS)
 """The optional outputs of `rasterize`, in the order of `Rendering`."""

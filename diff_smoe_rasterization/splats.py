@@ -7,7 +7,7 @@ import torch
 
 from .autograd import INPUTS  # which also registers the ops
 from .checks import check_tensors
-from .settings import Contributions, Importance
+from .settings import Contributions, GateMap, Importance
 
 _OPS = torch.ops.diff_smoe_rasterization
 
@@ -78,6 +78,13 @@ class Splats:
         return Importance(*_OPS.importance(pixel_weights.detach(), share_weights.detach(), self._color, self._gate_sum,
                                            self._background, self._radii, self._saved, self._background_gate,
                                            *self._options))
+
+    def gate_map(self) -> GateMap:
+        """Finds the Gaussian with the largest gate in each pixel; the background is no candidate.
+
+        The same bits from call to call. On CUDA the host does not wait.
+        """
+        return GateMap(*_OPS.gate_map(self._radii, self._saved, self._background_gate, *self._options))
 
     def _of_visible(self, values: torch.Tensor) -> torch.Tensor:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""

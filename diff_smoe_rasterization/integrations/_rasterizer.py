@@ -18,7 +18,7 @@ from .contracts import RESULTS, contract_of
 
 ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",),
               "opacity": ("alpha",)}
-COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums")  # results that need another walk
+COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums", "largest")  # results that need another walk
 
 
 def pixel_rays(settings: Settings, like: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
@@ -68,6 +68,9 @@ def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any])
         found.update(pixels=sums.pixels.to(rendering.color.dtype)[:, None], weights=sums.blend_weights,
                      n_touched=sums.pixels, counts=sums.pixels,
                      opacity_sums=sums.pixels * inputs["opacities"].detach().reshape(-1))
+        if "largest" in names:
+            largest = splats.gate_map().gaussians
+            found["largest"] = torch.bincount(largest[largest >= 0], minlength=len(sums.pixels)).to(sums.blend_weights)
     else:
         rendering = rasterize(settings=settings, outputs=outputs, **inputs)
     found.update(color=rendering.color, radii=rendering.radii, inverse_depth=rendering.inverse_depth,

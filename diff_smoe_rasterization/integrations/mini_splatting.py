@@ -1,32 +1,21 @@
 """The API of Mini-Splatting's rasterizer: scores of each Gaussian beside the image, and `render_depth`.
 
-Which Gaussian has the largest weight in a pixel is found by one more walk over the image, in plain torch. That takes
-many times as long as the rendering. The original's rays of `render_depth` are shifted by 1% of the way to the origin;
-these go through the pixels' centres.
+The original's rays of `render_depth` are shifted by 1% of the way to the origin; these go through the pixels' centres.
 """
 from __future__ import annotations
 
-from typing import Any, Dict
+from typing import Dict
 
 import torch
 
-from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
+from diff_smoe_rasterization import rasterize_with_splats
 from diff_smoe_rasterization.gaussians import quaternion_to_matrix
 
-from ._rasterizer import classes_of, pixel_rays, results_of
-from ._walk import Walk
+from ._rasterizer import classes_of, pixel_rays, share_of_gaussians
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
-
-def _render(settings, inputs):
-    color, *rest = results_of(("color", "radii", "weights", "counts"), settings, inputs)
-    strongest = _strongest(settings, inputs).reshape(-1)
-    pixels = torch.bincount(strongest[strongest >= 0], minlength=len(inputs["means3D"]))
-    return color, *rest, pixels.to(color.dtype)
-
-
-GaussianRasterizationSettings, _Rasterizer, rasterize_gaussians = classes_of("mini_splatting", __name__, _render)
+GaussianRasterizationSettings, _Rasterizer, rasterize_gaussians = classes_of("mini_splatting", __name__)
 
 
 class GaussianRasterizer(_Rasterizer):
@@ -46,10 +35,9 @@ class GaussianRasterizer(_Rasterizer):
         if scales is None or rotations is None or not len(scales):
             raise ValueError("render_depth needs Gaussians with scales and rotations")
         settings = self.raster_settings
-        inputs = {"means3D": means3D, "opacities": opacities, "shs": shs, "colors_precomp": colors_precomp,
-                  "scales": scales, "rotations": rotations}
-        color, share = results_of(("color", "alpha"), settings, inputs)
-        gidx = _strongest(settings, inputs)
+        rendering, splats = rasterize_with_splats(means3D, opacities, settings, shs=shs, colors_precomp=colors_precomp,
+                                                  scales=scales, rotations=rotations, outputs=("alpha",))
+        color, gidx = rendering.color, splats.gate_map().gaussians.long()
         found, shown = gidx >= 0, gidx.clamp(min=0)
         view = settings.viewmatrix.to(color)
         x, y = pixel_rays(settings, color)
@@ -64,20 +52,5 @@ class GaussianRasterizer(_Rasterizer):
         length = (ray * ray).sum(-1).sqrt()  # the original's ray has the length 1 here
         images = {"out_pts": (origin + depth[..., None] * ray).permute(2, 0, 1), "rendered_depth": depth[None],
                   "discriminants": ((b * b - 4 * a * c) / length**2)[None], "gidx": shown[None].int()}
-        return {"render": color, "accum_alpha": 1 - share,
+        return {"render": color, "accum_alpha": 1 - share_of_gaussians(rendering.alpha, settings),
                 **{name: image.masked_fill(~found, 0) for name, image in images.items()}}
-
-
-@torch.no_grad()
-def _strongest(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
-    """Returns which Gaussian has the largest weight in each pixel [H, W], -1 where none has one."""
-    walk = Walk(settings, inputs)
-    best = walk.image_of_tiles(0.0)
-    strongest = walk.image_of_tiles(-1)
-    for tiles, which, weight in walk.steps():
-        largest, index = weight.max(1)
-        better = largest > best[tiles]
-        best[tiles] = torch.where(better, largest, best[tiles])
-        found = which.gather(1, index.flatten(1)).reshape(index.shape)
-        strongest[tiles] = torch.where(better, found, strongest[tiles])
-    return walk.untiled(strongest)

@@ -82,7 +82,7 @@ def copy(path: Path, pages: Path) -> None:
 def header_pages() -> str:
     """One page with every public header: its comments and its declarations, bodies of functions left out."""
     names = [name for name in FIRST if (INCLUDE / name).is_file()]
-    names += sorted(path.name for path in INCLUDE.glob("*.h") if path.name not in FIRST)
+    names += sorted({path.relative_to(INCLUDE).as_posix() for path in INCLUDE.rglob("*.h")} - {*FIRST})
     headers = [(f"dsmoe/{name}", INCLUDE / name) for name in names]
     headers += [(f"io/{name}", IO / name) for name in IO_HEADERS]
     lines = ["# C++", "", "The public headers, with their comments; bodies of functions are left out. [C++ without",

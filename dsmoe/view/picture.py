@@ -12,7 +12,6 @@ from diff_smoe_rasterization.settings import GATED_MODES, resolve_background_gat
 from ..inspection import to_image
 from ..results.rendering import Renderer
 from ..scenes.cameras import Camera
-from .gate_map import largest_gates
 
 SHOWN = ("colour", "gates", "largest gate", "depth", "coverage")
 LINE = (255, 255, 255)  # between two blends
@@ -78,10 +77,10 @@ def _of_blend(renderer: Renderer, camera: Camera, blend: Blend, shown: str) -> n
 
 def _gate_map(renderer: Renderer, camera: Camera) -> torch.Tensor:
     """[3, H, W] the colour of the Gaussian with the largest gate, and the background where none is open."""
-    largest = largest_gates(renderer.model, renderer.settings_of(camera)).to(renderer.background.device)
+    _, splats = renderer.with_splats(camera)
     colours = torch.cat([own_colours(renderer.model.num_gaussians).to(renderer.background),
                          renderer.background[None]])
-    return colours[largest].permute(2, 0, 1)  # -1 is the last row
+    return colours[splats.gate_map().gaussians.long()].permute(2, 0, 1)  # -1 is the last row
 
 
 def own_colours(count: int) -> torch.Tensor:

@@ -10,7 +10,7 @@
 
 #include "dispatch.h"
 #include "dsmoe/arrays.h"
-#include "dsmoe/contribution.h"
+#include "dsmoe/passes/contributions.h"
 #include "dsmoe/pixel.h"
 #include "test_scene.h"
 
@@ -49,7 +49,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     out.radii.push_back(projection.radius);
     projected[i] = projection.gaussian;
   }
-  out.contributions.resize(scene.count, no_contribution<double>());
+  out.contributions.resize(scene.count);
   std::vector<int64_t> order;
   for (int64_t i = 0; i < scene.count; ++i) {
     if (out.radii[i] > 0) order.push_back(i);

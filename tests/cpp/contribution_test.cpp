@@ -1,6 +1,4 @@
 // What pixels say of a Gaussian: the pair's numbers by hand, and the CPU backend's sums over whole images.
-#include "dsmoe/contribution.h"
-
 #include <gtest/gtest.h>
 
 #include <limits>
@@ -8,6 +6,7 @@
 
 #include "all_modes.h"
 #include "brute_force.h"
+#include "dsmoe/passes/contributions.h"
 #include "test_scene.h"
 
 namespace dsmoe {
@@ -19,7 +18,7 @@ TYPED_TEST_SUITE(AddPair, Scalars);
 
 TYPED_TEST(AddPair, AddsFourNumbersOfAPairThatContributes) {
   using S = TypeParam;
-  auto sum = no_contribution<S>();
+  Contribution<S> sum = {};
   add_pair(sum, true, S(-2), S(0.25), S(3), S(-4));
   add_pair(sum, true, S(7), S(0.5), S(0), S(2));
   EXPECT_EQ(sum.pixel_weight, S(5));
@@ -31,7 +30,7 @@ TYPED_TEST(AddPair, AddsFourNumbersOfAPairThatContributes) {
 TYPED_TEST(AddPair, AddsNothingOfOthersWhateverTheyHold) {
   using S = TypeParam;
   const S nan = std::numeric_limits<S>::quiet_NaN();
-  auto sum = no_contribution<S>();
+  Contribution<S> sum = {};
   add_pair(sum, false, nan, nan, nan, nan);
   EXPECT_EQ(sum.pixel_weight, S(0));
   EXPECT_EQ(sum.pixels, S(0));

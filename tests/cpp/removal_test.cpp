@@ -60,7 +60,7 @@ template <BlendMode kMode, class S> void expect_omissions(const Pixel& pixel, do
     const S distance = S(pixel.color[i]) - value;
     const S to_rest = channel_change<kMode>(removal, distance, front, value), to_background = background - value;
     const S change = removal.left ? to_rest : to_background;
-    auto sum = no_importance<S>();
+    Importance<S> sum = {};
     add_pair(sum, removal, to_rest * to_rest, to_background * to_background, S(1), S(1));
     front = fma(removal.weight, distance, front);
     EXPECT_TRUE(removal.takes);
@@ -164,7 +164,7 @@ TEST(Removal, OfAPairThatIsNotThereIsNothing) {
   PixelState<double> state = PixelState<double>::open();
   const PixelEnd<double> end = {0.5, 0.5, 0.0};
   const Gate<double> absent = {0.7, 0.7, false};
-  auto sum = no_importance<double>();
+  Importance<double> sum = {};
   const double nan = std::numeric_limits<double>::quiet_NaN();
   add_pair(sum, remove_pair<BlendMode::kSmoe>(state, end, absent, true), nan, nan, nan, nan);
   EXPECT_EQ(sum.share, 0);
@@ -175,7 +175,7 @@ TEST(Removal, OfAPairThatIsNotThereIsNothing) {
 TEST(Removal, WeighsItsThreeSums) {
   PixelState<double> state = PixelState<double>::open();
   const Gate<double> gate = {0.5, 0.5, true};
-  auto sum = no_importance<double>();
+  Importance<double> sum = {};
   add_pair(sum, remove_pair<BlendMode::kAlpha>(state, {0.5, 0.5, 1.0}, gate, true), 9.0, 8.0, 3.0, 2.0);
   EXPECT_EQ(sum.share, 1.5);
   EXPECT_EQ(sum.squared_share, 0.5);

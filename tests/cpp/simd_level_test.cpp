@@ -69,9 +69,9 @@ template <class S> std::vector<S> contributions_at(const SimdLevel& level, const
   std::vector<S> pixel_weights;
   for (int64_t pixel = 0; pixel < scene.pixels(); ++pixel) pixel_weights.push_back(brute_force_pixel_weight<S>(pixel));
   std::vector<Contribution<S>> out(r.instances.size(), Contribution<S>{-1, -1, -1, -1});
-  const TileContributions<S> contributions = {pixel_weights.data(), out.data()};
+  const ContributionPass<S> pass = {{pixel_weights.data(), {}}};
   for_each_tile(config, saved, camera.width, camera.height, 0, [&](const Tile<S>& tile, S* scratch) {
-    return kernels_of<S>(level).contributions(tile, contributions, scratch);
+    return kernels_of<S>(level).contributions(tile, pass, out.data(), scratch);
   });
   std::vector<S> flat;
   for (const auto& c : out) flat.insert(flat.end(), {c.pixel_weight, c.pixels, c.blend_weight, c.distance});
@@ -88,10 +88,10 @@ template <class S> std::vector<S> importance_at(const SimdLevel& level, const Sc
   map.color = r.color.data();
   map.pixel_weights = map.share_weights = weights.data();
   std::vector<Importance<S>> out(r.instances.size(), Importance<S>{-1, -1, -1});
-  const TileImportances<S> importances = {map, out.data()};
-  for_each_tile(
-      config, saved, scene.camera.width, scene.camera.height, kImportanceArrays + 2 * config.num_channels,
-      [&](const Tile<S>& tile, S* scratch) { return kernels_of<S>(level).importance(tile, importances, scratch); });
+  for_each_tile(config, saved, scene.camera.width, scene.camera.height, kImportanceArrays + 2 * config.num_channels,
+                [&](const Tile<S>& tile, S* scratch) {
+                  return kernels_of<S>(level).importance(tile, {map}, out.data(), scratch);
+                });
   std::vector<S> flat;
   for (const auto& i : out) flat.insert(flat.end(), {i.share, i.squared_share, i.removal_cost});
   return flat;

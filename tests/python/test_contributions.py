@@ -10,7 +10,7 @@ from comparison import assert_close, assert_same_gradients, one_thread
 from devices import default_device, on_the_cpu, random_normal
 from scenes import blend_of, gate_of, gradients, random_scene, transmittance_of, with_gate, with_gates
 
-from diff_smoe_rasterization import Contributions, rasterize, rasterize_with_splats, reference
+from diff_smoe_rasterization import Contributions, GateMap, rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.settings import OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -100,6 +100,27 @@ def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
     assert_close(actual.pixel_weights, (pixel_weights.double() * blended).sum((1, 2)), tolerance, "pixel weights")
     assert_close(actual.blend_weights, weights.sum((1, 2)), tolerance, "blend weights")
     assert_close(actual.distances, (distances * blended).sum((1, 2)), tolerance, "distances")
+
+
+@with_gate
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_gate_map_is_what_the_image_was_blended_of(mode, dtype):
+    """As above; what divides the weights of a pixel does not change which is the largest."""
+    count = 40
+    scene = random_scene(mode, count, 61, 43, scale=0.1, opacity=(0.1, 3.0), channels=count, dtype=dtype,
+                         bg=torch.zeros(count))
+    scene = scene.with_inputs(colors_precomp=torch.eye(count, dtype=dtype))
+    rendering, splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)
+    actual = splats.gate_map()
+    assert isinstance(actual, GateMap)
+    assert all(image.shape == (43, 61) and image.dtype == torch.int32 for image in actual)
+    best = rendering.color.topk(2, dim=0)
+    assert torch.equal(actual.counts, (rendering.color > 0).sum(0).int())
+    empty = best.values[0] == 0
+    assert empty.any() and torch.equal(actual.gaussians < 0, empty)
+    clear = best.values[0] > 1.0001 * best.values[1]  # rounding may turn what is closer
+    assert clear.sum() > 500 and torch.equal(actual.gaussians[clear], best.indices[0][clear].int())
+    assert len(actual.gaussians.unique()) > 20
 
 
 @with_gates

@@ -57,7 +57,7 @@ def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
 def test_the_page_of_headers_has_declarations_and_no_bodies(stage):
     text = stage.header_pages()
     headers = re.findall(r"^## (.*)$", text, re.MULTILINE)
-    public = {f"dsmoe/{path.name}" for path in stage.INCLUDE.glob("*.h")}
+    public = {f"dsmoe/{path.relative_to(stage.INCLUDE)}" for path in stage.INCLUDE.rglob("*.h")}
     assert set(headers) == public | {f"io/{name}" for name in stage.IO_HEADERS}
     declaration = "template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);"
     assert declaration in text and "// Renders frame.inputs to frame.images and fills frame.saved." in text

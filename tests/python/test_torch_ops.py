@@ -127,12 +127,20 @@ def test_opcheck_of_importance(mode):
     torch.library.opcheck(op, arguments, **parts)
 
 
+@SHAPES
+def test_opcheck_of_gate_map(mode):
+    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
+    images, saved = op_results(scene)
+    torch.library.opcheck(torch.ops.diff_smoe_rasterization.gate_map.default,
+                          op_arguments(scene, "gate_map", radii=images["radii"], saved=list(saved.values())))
+
+
 @pytest.mark.parametrize("mode", REMOVABLE_MODES)
 def test_compiled_contributions_equal_eager(mode):
     def score(settings, pixel_weights, **inputs):
         rendering, splats = diff_smoe_rasterization.rasterize_with_splats(settings=settings, **inputs)
         return (rendering.color, splats.centers, splats.depths, *splats.contributions(pixel_weights),
-                *splats.importance(pixel_weights))
+                *splats.importance(pixel_weights), *splats.gate_map())
 
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32, degree=1)
     pixel_weights = random_normal((30, 40), 1, torch.float32).abs()

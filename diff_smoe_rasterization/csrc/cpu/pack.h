@@ -241,6 +241,7 @@ DSMOE_HD Pack<double> exp(Pack<double> x) {
 template <class T> struct RealTraits<DSMOE_SIMD::Pack<T>> {
   using Scalar = T;
   using Mask = DSMOE_SIMD::PackMask<T>;
+  using Whole = DSMOE_SIMD::Pack<T>;
 };
 
 }  // namespace dsmoe

@@ -2,7 +2,6 @@
 // Included once per instruction set.
 #pragma once
 
-#include "dsmoe/removal.h"
 #include "tile_walk_impl.h"
 
 namespace dsmoe {
@@ -15,7 +14,8 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   static constexpr BlendMode kMode = kBlendMode;
   static constexpr bool kBackToFront = false;
 
-  DSMOE_HD ImportanceVisitor(const Tile<S>& tile, Scratch<S> scratch, const TileImportances<S>& out)
+  DSMOE_HD ImportanceVisitor(const Tile<S>& tile, Scratch<S> scratch, const ImportanceMap<S>& map,
+                             Importance<S>* records)
       : num_channels_(kFeatures != kAnyFeatures ? kFeatures : tile.config.num_channels),
         background_(tile.config.background),
         lambda_(tile.config.blend.lambda()),
@@ -28,7 +28,8 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
         share_weight_(scratch.pixels()),
         alone_(scratch.pixels()),
         channels_{scratch.next},
-        out_(out) {
+        map_(map),
+        records_(records) {
     for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
     for (int i = 0; i < kTilePixels * (kImportanceArrays - 1 + 2 * num_channels_); ++i) gate_sum_.values[i] = S(0);
   }
@@ -44,10 +45,10 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
       const S tails = Blend<kMode>::kTails ? tile.saved.tails[index] : S(0);
       gate_sum_.pixel(x, y) = tails;
       end_gate_sum_.pixel(x, y) = tile.saved.gate_sum[index] + tails;
-      weight_.pixel(x, y) = out_.map.pixel_weights[index];
-      share_weight_.pixel(x, y) = out_.map.share_weights[index];
+      weight_.pixel(x, y) = map_.pixel_weights[index];
+      share_weight_.pixel(x, y) = map_.share_weights[index];
       for (int c = 0; c < num_channels_; ++c) {
-        const S value = out_.map.color[c * pixels + index], distance = background_[c] - value;
+        const S value = map_.color[c * pixels + index], distance = background_[c] - value;
         value_of(c).pixel(x, y) = value;
         front_of(c).pixel(x, y) = tails > S(0) ? tails * distance : S(0);
         alone_.pixel(x, y) += distance * distance;
@@ -57,11 +58,11 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
     return num_seen;
   }
 
-  DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(out_.instances + slot, 1); }
+  DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(records_ + slot, 1); }
   DSMOE_HD Importance<P> begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);
-    return no_importance<P>();
+    return {};
   }
   DSMOE_HD bool wanted(int at, Mask<P>& not_past) const {
     not_past = position_ < last_.load(at);
@@ -86,7 +87,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   }
 
   DSMOE_HD void end(const ListedGaussian<S>& gaussian, const Importance<P>& sum) const {
-    out_.instances[gaussian.slot] = {sum_lanes(sum.share), sum_lanes(sum.squared_share), sum_lanes(sum.removal_cost)};
+    records_[gaussian.slot] = {sum_lanes(sum.share), sum_lanes(sum.squared_share), sum_lanes(sum.removal_cost)};
   }
 
  private:
@@ -99,28 +100,30 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   const PixelArray<S> transmittance_, gate_sum_, last_, end_transmittance_, end_gate_sum_, weight_, share_weight_;
   const PixelArray<S> alone_;     // |bg - C|^2
   const PixelArray<S> channels_;  // two arrays a channel: C, and A
-  const TileImportances<S>& out_;
+  const ImportanceMap<S>& map_;
+  Importance<S>* const records_;
   const S* features_ = nullptr;
   P position_;
 };
 
 template <class S, BlendMode kMode, int kFeatures>
-int64_t importance_of_tile(const Tile<S>& tile, const TileImportances<S>& out, S* memory) {
+int64_t importance_of_tile(const Tile<S>& tile, const ImportanceMap<S>& map, Importance<S>* records, S* memory) {
   Scratch<S> scratch = {memory};
   const WidePixels<kMode, S> wide(tile, scratch.pixels());
-  ImportanceVisitor<S, kMode, kFeatures> visitor(tile, scratch, out);
+  ImportanceVisitor<S, kMode, kFeatures> visitor(tile, scratch, map, records);
   const int64_t num_seen = visitor.read(tile);
   const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
-  for (int64_t i = end; i < tile.end; ++i) out.instances[tile.saved.instances[i].slot] = no_importance<S>();
+  for (int64_t i = end; i < tile.end; ++i) records[tile.saved.instances[i].slot] = {};
   return walk_tile(tile, tile.begin, end, tile.config.num_features(), wide, visitor);
 }
 
-template <class S> int64_t importance(const Tile<S>& tile, const TileImportances<S>& out, S* scratch) {
+template <class S>
+int64_t importance(const Tile<S>& tile, const ImportancePass<S>& pass, Importance<S>* records, S* scratch) {
   int64_t pairs = 0;
   dispatch_blend(tile.config.blend.mode, tile.config.num_channels, [&](auto mode, auto channels) {
     constexpr BlendMode kMode = decltype(mode)::value;
     constexpr int kChannels = decltype(channels)::value;
-    if constexpr (kRemovable<kMode>) pairs = importance_of_tile<S, kMode, kChannels>(tile, out, scratch);
+    if constexpr (kRemovable<kMode>) pairs = importance_of_tile<S, kMode, kChannels>(tile, pass.map, records, scratch);
   });
   return pairs;
 }

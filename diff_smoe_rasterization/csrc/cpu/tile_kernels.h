@@ -4,9 +4,10 @@
 
 #include <cstdint>
 
-#include "dsmoe/contribution.h"
 #include "dsmoe/params.h"
-#include "dsmoe/removal.h"
+#include "dsmoe/passes/contributions.h"
+#include "dsmoe/passes/gate_map.h"
+#include "dsmoe/passes/importance.h"
 
 namespace dsmoe {
 namespace cpu {
@@ -32,18 +33,6 @@ template <class S> struct TileGradients {
   bool absolute = false;  // records end with sums of absolute gradients by the mean
 };
 
-// What is summed over a tile's pixels, from a map of the caller's.
-template <class S> struct TileContributions {
-  const S* pixel_weights;      // [H, W]
-  Contribution<S>* instances;  // [I] by slot; the tile's are written whole
-};
-
-// What each Gaussian is worth to a tile's pixels.
-template <class S> struct TileImportances {
-  const ImportanceMap<S>& map;
-  Importance<S>* instances;  // [I] by slot; the tile's are written whole
-};
-
 // Numbers that the backward pass of a tile writes for an instance.
 constexpr int record_size(int num_features, bool absolute) {
   return kNumGateMoments + num_features + (absolute ? kNumAbsoluteSums : 0);
@@ -57,13 +46,18 @@ inline int64_t tile_scratch_size(int num_features) {
   return static_cast<int64_t>(kTilePixels) * (num_features + 6) + 16 * num_features;
 }
 
+// records: [I] the sums of a pass by slot; those of the tile are written whole. Null without sums.
+template <class S, class Pass>
+using PassKernel = int64_t (*)(const Tile<S>& tile, const Pass& pass, typename Pass::template Sums<S>* records,
+                               S* scratch);
+
 // All return the number of (Gaussian, pixel) pairs whose exponent they evaluated. scratch: 64-byte aligned.
 template <class S> struct TileKernels {
   int64_t (*forward)(const Tile<S>& tile, const ImageOutputs<S>& images, S* scratch);
   int64_t (*backward)(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch);
-  int64_t (*contributions)(const Tile<S>& tile, const TileContributions<S>& contributions, S* scratch);
-  int64_t (*importance)(const Tile<S>& tile, const TileImportances<S>& importances, S* scratch);
-  int64_t (*gate_map)(const Tile<S>& tile, const GateMap& map, S* scratch);
+  PassKernel<S, ContributionPass<S>> contributions;
+  PassKernel<S, ImportancePass<S>> importance;
+  PassKernel<S, GateMapPass<S>> gate_map;
 };
 
 // One of these per instruction set that the compiler can build for.

@@ -2,10 +2,9 @@
 #pragma once
 
 #include "tile_backward_impl.h"
-#include "tile_contributions_impl.h"
 #include "tile_forward_impl.h"
-#include "tile_gate_map_impl.h"
 #include "tile_importance_impl.h"
+#include "tile_pass_impl.h"
 
 namespace dsmoe {
 namespace cpu {
@@ -13,7 +12,7 @@ namespace DSMOE_SIMD {
 
 // A constant expression: no code of this instruction set runs before it is known to be there.
 template <class S> constexpr TileKernels<S> kernels() {
-  return {forward<S>, backward<S>, contributions<S>, importance<S>, gate_map<S>};
+  return {forward<S>, backward<S>, pass<S, ContributionPass<S>>, importance<S>, pass<S, GateMapPass<S>>};
 }
 
 }  // namespace DSMOE_SIMD

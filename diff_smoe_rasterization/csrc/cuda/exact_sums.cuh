@@ -7,18 +7,12 @@
 
 #include <type_traits>
 
+#include "dsmoe/passes/pass.h"
 #include "exponents.cuh"
 #include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {
-
-// Up to four arrays of sums.
-template <class S> struct SumTargets {
-  static constexpr int kMost = 4;
-  S* numbers[kMost];  // [N] each
-  int count;
-};
 
 template <class S> struct AtomicSums {
   SumTargets<S> to;

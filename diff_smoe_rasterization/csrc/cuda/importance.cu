@@ -6,8 +6,7 @@
 #include "../dispatch.h"
 #include "../refuse.h"
 #include "bands.h"
-#include "dsmoe/params.h"
-#include "dsmoe/removal.h"
+#include "dsmoe/passes/importance.h"
 #include "exact_sums.cuh"
 #include "reduce.cuh"
 #include "segments.cuh"
@@ -82,7 +81,7 @@ template <class S, int kChannels> struct WeighedPixels {
 // The numbers of one Gaussian in shared memory, by lane. Four lanes sum a row. Between its rows lie some numbers, so
 // that lanes of eight rows read from different banks.
 template <class S> struct ImportanceRow {
-  alignas(16) S numbers[kNumImportances][kWarp];
+  alignas(16) S numbers[Importance<S>::kNum][kWarp];
   S apart[16 / sizeof(S)];
 };
 
@@ -92,9 +91,9 @@ __device__ void add_rows(const Sums& sums, const ImportanceRow<S>* rows, const i
                          int lane) {
   constexpr int kParts = kWarp / kVisitsPerCheck, kPart = kWarp / kParts;
   const int g = lane / kParts, part = lane % kParts;
-  S totals[kNumImportances];
+  S totals[Importance<S>::kNum];
 #pragma unroll
-  for (int n = 0; n < kNumImportances; ++n) {
+  for (int n = 0; n < Importance<S>::kNum; ++n) {
     S values[kPart];
 #pragma unroll
     for (int i = 0; i < kPart; ++i) values[i] = rows[g].numbers[n][part * kPart + i];
@@ -107,7 +106,7 @@ __device__ void add_rows(const Sums& sums, const ImportanceRow<S>* rows, const i
 #pragma unroll
     for (int step = kParts / 2; step > 0; step /= 2) totals[n] += __shfl_xor_sync(kAllLanes, totals[n], step);
   }
-  if (g >= count || part >= kNumImportances) return;
+  if (g >= count || part >= Importance<S>::kNum) return;
   sums.add(part, gaussians[g], part == 0 ? totals[0] : part == 1 ? totals[1] : totals[2]);
 }
 
@@ -131,7 +130,7 @@ template <class S, BlendMode kMode, int kChannels, class Sums, Pairs kWanted> st
     const S dy = S(tile.y) - gaussian.mean.y;
     const int32_t index = number;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(arguments.config.num_features());
-    auto sum = no_importance<S>();
+    Importance<S> sum = {};
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
       const auto gate = evaluate_pair<kPairs>(gaussian.gate, exponent.at(below(dy, k)), pixels.wide[k]);
@@ -307,8 +306,7 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
       });
     });
   };
-  const ImportanceSums<S>& sums = map.sums;
-  sum_terms(frame, SumTargets<S>{{sums.shares, sums.squared_shares, sums.removal_costs}, 3}, work, walk);
+  sum_terms(frame, ImportancePass<S>{map}.targets(), work, walk);
 }
 
 #define DSMOE_INSTANTIATE(S) template void importance(const Frame<S>&, const ImportanceMap<S>&, const Work&);

@@ -164,8 +164,10 @@ void check_contribution_arguments(const char* function, const Tensor& pixel_weig
   check_result(function, "radii", radii, {radii.numel()}, kInt, radii.device());
   DSMOE_CHECK_VALUE(!saved.empty(), function, ": saved has length 0; it must be what rasterize returned");
   check_real(function, "saved[0]", saved[0]);
-  check_like(function, "pixel_weights", pixel_weights, "means3D", saved[0]);
-  check_shape(function, "pixel_weights", pixel_weights, {options.image_height, options.image_width});
+  if (pixel_weights.defined()) {
+    check_like(function, "pixel_weights", pixel_weights, "means3D", saved[0]);
+    check_shape(function, "pixel_weights", pixel_weights, {options.image_height, options.image_width});
+  }
   if (background_gate.defined()) check_like(function, "background_gate", background_gate, "means3D", saved[0]);
   check_background_gate(function, background_gate);
 }

@@ -411,6 +411,23 @@ template <class Backend> void importance(Arguments& arguments) {
   arguments.give_back(shares, squared_shares, removal_costs);
 }
 
+template <class Backend> void gate_map(Arguments& arguments) {
+  const auto radii = arguments.read<Tensor>();
+  const auto saved = arguments.read<Saved>();
+  const Tensor background_gate = read_optional(arguments);
+  const auto options = read_options(arguments);
+  check_contribution_arguments("gate_map", Tensor(), radii, saved, background_gate, options);
+  const typename Backend::Guard guard(radii.device());
+  const auto image = [&] { return empty({options.image_height, options.image_width}, radii, kInt); };
+  const Tensor gaussians = image(), counts = image();
+  dispatch("gate_map", saved[0], [&](auto zero) {
+    using S = decltype(zero);
+    const GateMap map = {mutable_data<int32_t>(gaussians), mutable_data<int32_t>(counts)};
+    Backend::template gate_map<S>(radii, saved, blend_config<S>(background_gate, options), options, map);
+  });
+  arguments.give_back(gaussians, counts);
+}
+
 template <class Backend>
 Tensor pack_footprints(const Tensor& gates, const Tensor& features, const Tensor& radii, const Tensor& visible) {
   const char* function = "pack_footprints";
@@ -442,6 +459,7 @@ template <class Backend> void register_ops(Library& m) {
   implement<&radii<Backend>>(m, "radii");
   implement<&contributions<Backend>>(m, "contributions");
   implement<&importance<Backend>>(m, "importance");
+  implement<&gate_map<Backend>>(m, "gate_map");
   implement<&with_arguments<&pack_footprints<Backend>>>(m, "pack_footprints");
   implement<&with_arguments<&mark_visible<Backend>>>(m, "mark_visible");
 }

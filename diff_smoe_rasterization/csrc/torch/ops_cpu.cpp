@@ -135,14 +135,27 @@ struct Cpu {
     return frame;
   }
 
+  // The same with what it saved, for passes that read no features.
   template <class S>
-  static void contributions(const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
-                            const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
+  static cpu::Frame<S> walked(const char* function, const Tensor& radii, const Saved& saved,
+                              const RasterConfig<S>& config, const Options& options) {
     auto own = frame_of_rendering<S>(radii, config, options);
     SavedSizes sizes = cpu::saved_sizes(own);
     sizes.num_features = -1;
-    own.saved = unpack<S>("contributions", saved, sizes, radii.device());
-    cpu::contributions(own, {data<S>(pixel_weights), sums});
+    own.saved = unpack<S>(function, saved, sizes, radii.device());
+    return own;
+  }
+
+  template <class S>
+  static void contributions(const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
+                            const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
+    cpu::contributions(walked<S>("contributions", radii, saved, config, options), {data<S>(pixel_weights), sums});
+  }
+
+  template <class S>
+  static void gate_map(const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
+                       const GateMap& map) {
+    cpu::gate_map(walked<S>("gate_map", radii, saved, config, options), map);
   }
 
   template <class S>

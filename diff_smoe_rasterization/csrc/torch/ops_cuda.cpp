@@ -146,16 +146,30 @@ struct Cuda {
     return frame;
   }
 
+  // The same with what it saved, for passes that read no features.
+  template <class S>
+  static cuda::Frame<S> walked(const char* function, const Tensor& radii, const Saved& saved,
+                               const RasterConfig<S>& config, const Options& options) {
+    auto own = frame_of_rendering<S>(radii, config, options);
+    auto sizes = cuda::saved_sizes(own, run(options, nullptr));
+    sizes.num_features = -1;
+    own.saved = unpack<S>(function, saved, sizes, radii.device());
+    return own;
+  }
+
   template <class S>
   static void contributions(const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
-    auto own = frame_of_rendering<S>(radii, config, options);
-    const cuda::Run how = run(options, nullptr);
-    auto sizes = cuda::saved_sizes(own, how);
-    sizes.num_features = -1;
-    own.saved = unpack<S>("contributions", saved, sizes, radii.device());
     TensorMemory memory(pixel_weights);
-    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream, &memory, nullptr, how.deterministic});
+    cuda::contributions(walked<S>("contributions", radii, saved, config, options), {data<S>(pixel_weights), sums},
+                        {current_stream(), &memory, nullptr, options.deterministic});
+  }
+
+  template <class S>
+  static void gate_map(const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
+                       const GateMap& map) {
+    TensorMemory memory(radii);
+    cuda::gate_map(walked<S>("gate_map", radii, saved, config, options), map, {current_stream(), &memory});
   }
 
   template <class S>

@@ -277,4 +277,9 @@ Importance Splats::importance(const at::Tensor& pixel_weights, const at::Tensor&
   return {sums[0].toTensor(), sums[1].toTensor(), sums[2].toTensor()};
 }
 
+std::pair<at::Tensor, at::Tensor> Splats::gate_map() const {
+  const auto maps = score("gate_map", {}, saved_of(*this, "gate_map"));
+  return {maps[0].toTensor(), maps[1].toTensor()};
+}
+
 }  // namespace dsmoe

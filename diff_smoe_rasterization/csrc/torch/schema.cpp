@@ -80,6 +80,10 @@ const std::string kImportance =
     "Tensor[] saved, Tensor? background_gate, " +
     without_comma(kOptions) + ") -> (Tensor shares, Tensor squared_shares, Tensor removal_costs)";
 
+// From what one rasterize saved: the Gaussian of the greatest gate in each pixel [H, W], and how many have a part.
+const std::string kGateMap = "gate_map(Tensor radii, Tensor[] saved, Tensor? background_gate, " +
+                             without_comma(kOptions) + ") -> (Tensor gaussians, Tensor counts)";
+
 }  // namespace
 
 DSMOE_LIBRARY(m) {
@@ -94,5 +98,6 @@ DSMOE_LIBRARY(m) {
   m.def(kPackFootprints);
   m.def(kContributions.c_str());
   m.def(kImportance.c_str());
+  m.def(kGateMap.c_str());
   m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");
 }

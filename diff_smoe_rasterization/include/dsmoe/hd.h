@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cmath>
+#include <cstdint>
 
 #if defined(__CUDACC__)
 #define DSMOE_HD __host__ __device__ __forceinline__
@@ -14,18 +15,16 @@
 namespace dsmoe {
 
 // The other headers call these functions unqualified, so that argument-dependent lookup finds those of a SIMD pack.
-// A pack of pixels has a mask type and a scalar type. For a single pixel they are bool and the type itself.
-template <class Real> struct RealTraits;
-template <> struct RealTraits<float> {
-  using Scalar = float;
+// A pack of pixels has a mask type and a scalar type. For a single pixel they are bool and the type itself. Whole is
+// for whole numbers: counts, and places in a list.
+template <class Real> struct RealTraits {
+  using Scalar = Real;
   using Mask = bool;
-};
-template <> struct RealTraits<double> {
-  using Scalar = double;
-  using Mask = bool;
+  using Whole = int32_t;
 };
 template <class Real> using Mask = typename RealTraits<Real>::Mask;
 template <class Real> using Scalar = typename RealTraits<Real>::Scalar;
+template <class Real> using Whole = typename RealTraits<Real>::Whole;
 
 constexpr double kLog2E = 1.4426950408889634, kLn2 = 0.6931471805599453;
 

@@ -160,7 +160,7 @@ template <class S> struct ImageOutputs {
   S* gate_sum = nullptr;       // [H, W] the alpha image: W, or W / D in a mode with tails
 };
 
-// Sums over the pixels that blended a Gaussian, as contribution.h says; written whole.
+// Sums over the pixels that blended a Gaussian, as passes/contributions.h says; written whole.
 template <class S> struct ContributionSums {
   S* pixel_weights = nullptr;  // [N]
   int32_t* pixels = nullptr;   // [N]

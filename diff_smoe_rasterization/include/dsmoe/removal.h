@@ -34,13 +34,12 @@ template <class Real> struct Importance {
   Real share;          // f = w / D: how the pixel's colour follows the Gaussian's
   Real squared_share;  // f^2
   Real removal_cost;   // |C' - C|^2, summed over the channels
-};
-constexpr int kNumImportances = 3;
 
-template <class Real> DSMOE_HD Importance<Real> no_importance() {
-  const Real zero = Scalar<Real>(0);
-  return {zero, zero, zero};
-}
+  static constexpr int kNum = 3;
+  template <class Visit, class... Sums> static DSMOE_HD void for_each(Visit visit, Sums&... of) {
+    visit(of.share...), visit(of.squared_share...), visit(of.removal_cost...);
+  }
+};
 
 // A pair's removal. C' - C is channel_change where something is left, and else bg - C.
 template <class Real> struct Removal {

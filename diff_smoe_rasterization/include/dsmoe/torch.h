@@ -114,6 +114,10 @@ class Splats {
   /// pixel_weights: [H, W] e; undefined: 1. share_weights: [H, W] e of the shares; undefined: pixel_weights.
   Importance importance(const at::Tensor& pixel_weights = {}, const at::Tensor& share_weights = {}) const;
 
+  /// Returns gaussians [H, W] int32, which has the largest gate of the pixel, -1 where none has one; and counts [H, W]
+  /// int32, how many Gaussians are in the numerator.
+  std::pair<at::Tensor, at::Tensor> gate_map() const;
+
   struct Saved;                        // of the implementation
   std::shared_ptr<const Saved> saved;  // likewise
 };

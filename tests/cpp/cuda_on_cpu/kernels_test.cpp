@@ -40,17 +40,19 @@ template <class S> struct Results {
     return all;
   }
 
-  // Calls walk(contribution map, importance map), for sums over the pixels that count.
+  // Calls walk(contribution map, importance map, gate map), for sums over the pixels that count.
   template <class Walk> void weigh(const std::vector<bool>& unsure, Walk walk) {
     const size_t count = rendering.radii.size();
     std::vector<S> pixel_weights, unused(2 * count);
     for (const bool left_out : unsure) pixel_weights.push_back(S(!left_out));
     std::vector<int32_t> pixels(count);
+    greatest.assign(unsure.size(), -2), counts.assign(unsure.size(), -2);
     worth.assign(4 * count, is_removable(mode) ? S(NAN) : S(0));
     const auto sums = [&](int k) { return worth.data() + k * count; };
     walk(ContributionMap<S>{pixel_weights.data(), {sums(0), pixels.data(), unused.data(), unused.data() + count}},
          ImportanceMap<S>{
-             rendering.color.data(), pixel_weights.data(), pixel_weights.data(), {sums(1), sums(2), sums(3)}});
+             rendering.color.data(), pixel_weights.data(), pixel_weights.data(), {sums(1), sums(2), sums(3)}},
+         GateMap{greatest.data(), counts.data()});
   }
 
   BlendMode mode;
@@ -58,6 +60,7 @@ template <class S> struct Results {
   ImageWeights<S> weights;
   SceneGradient<S> gradient;
   std::vector<S> means2D_abs, worth;
+  std::vector<int32_t> greatest, counts;
 };
 
 // Pixels where rounding may turn a decision over show nothing: they get no weight.
@@ -73,8 +76,9 @@ Results<double> on_cpu(const Scene<double>& scene, const std::vector<bool>& unsu
   cpu::Frame<double> frame = {scene.inputs(), scene.camera, scene.raster_config(), out.rendering.images(), {}};
   cpu::Heap heap;
   cpu::forward(frame, heap);
-  out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
+  out.weigh(unsure, [&](const auto& contributions, const auto& importance, const GateMap& gates) {
     cpu::contributions(frame, contributions);
+    cpu::gate_map(frame, gates);
     if (is_removable(frame.config.blend.mode)) cpu::importance(frame, importance);
   });
   cpu::backward(frame, out.gradients());
@@ -128,8 +132,9 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   if (frame.saved.capacity > 0) expect_longest_first(frame.saved, int64_t(grid.columns) * grid.rows);
   const cuda::Work work = {nullptr, &memory, nullptr, how.deterministic};
   if (how.weighs) {
-    out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
+    out.weigh(unsure, [&](const auto& contributions, const auto& importance, const GateMap& gates) {
       cuda::contributions(frame, contributions, work);
+      cuda::gate_map(frame, gates, work);
       if (is_removable(frame.config.blend.mode)) cuda::importance(frame, importance, work);
     });
   }
@@ -167,8 +172,9 @@ void expect_near(const std::vector<float>& actual, const std::vector<double>& ex
 void expect_cpu(const Scene<double>& of, const How& how = {}) {
   const Scene<float> scene = convert<float>(of);
   const Scene<double> same = convert<double>(scene);
+  const BruteForce<double> truth = brute_force(same);
   std::vector<bool> unsure;
-  for (const double margin : brute_force(same).margin) unsure.push_back(margin < 3e-5);
+  for (const double margin : truth.margin) unsure.push_back(margin < 3e-5);
   Results<float> actual = by_kernels(scene, unsure, how);
   Results<double> expected = on_cpu(same, unsure);
   EXPECT_EQ(actual.rendering.radii, expected.rendering.radii);
@@ -176,6 +182,12 @@ void expect_cpu(const Scene<double>& of, const How& how = {}) {
   expect_close(actual.rendering.gate_sum, expected.rendering.gate_sum, unsure, "gate sum");
   expect_close(actual.rendering.depth, expected.rendering.depth, unsure, "depth");
   expect_near(actual.all_gradients(), expected.all_gradients(), "gradients");
+  for (size_t pixel = 0; pixel < unsure.size(); ++pixel) {
+    if (unsure[pixel]) continue;
+    ASSERT_EQ(actual.counts[pixel], expected.counts[pixel]) << pixel;
+    if (truth.lead[pixel] < 4e-4) continue;  // two alphas, each rounded by up to 2e-4 of itself
+    ASSERT_EQ(actual.greatest[pixel], expected.greatest[pixel]) << pixel;
+  }
   for (size_t k = 0; k < 4; ++k) {
     const auto part = [&](const auto& worth) {
       const auto begin = worth.begin() + k * of.count;

@@ -26,7 +26,6 @@ from dsmoe.train import Run, train
 from dsmoe.training.trainer import Trainer
 from dsmoe.view import server
 from dsmoe.view.following import Followed
-from dsmoe.view.gate_map import largest_gates
 from dsmoe.view.guard import CAMERA, is_wanted, refusal
 from dsmoe.view.picture import SHOWN, Blend, Look, own_colours, picture
 
@@ -88,16 +87,18 @@ def test_gates_have_distinct_colours_and_show_the_one_that_is_open(opened):
                                         ("smoe_tn", 0.0), ("smoe_std", 0.0)])
 def test_the_gate_map_has_the_largest_weight_of_each_pixel(opened, mode, gate):
     """A rendering with a channel for each Gaussian says all weights, but for what divides them."""
-    model, camera = opened.renderer.model, opened.cameras[0].resized(100, 75)  # more than one block
+    model, camera = opened.renderer.model, opened.cameras[0].resized(100, 75)  # more than one tile
     renderer = Renderer(model, mode, torch.zeros(60), background_gate=gate)
     with torch.no_grad():
         weights = renderer(camera, colors_precomp=torch.eye(60)).color
     best = weights.topk(2, dim=0)
-    found = largest_gates(model, renderer.settings_of(camera))
-    assert torch.equal(found < 0, best.values[0] == 0)
-    clear = best.values[0] > 1.0001 * best.values[1]  # rounding may turn what is closer
-    assert clear.double().mean() > 0.5 and torch.equal(found[clear], best.indices[0][clear])
-    assert len(found.unique()) > 20
+    which = best.indices[0].masked_fill(best.values[0] == 0, -1)
+    colours = torch.cat([own_colours(60), opened.renderer.background[None]])
+    expected = np.asarray(to_image(colours[which].permute(2, 0, 1)))
+    shown = picture(opened.renderer, camera, Look(Blend(mode, gate), "largest gate"))
+    clear = (best.values[0] > 1.0001 * best.values[1]) | (which < 0)  # rounding may turn what is closer
+    assert clear.double().mean() > 0.5 and np.array_equal(shown[clear], expected[clear])
+    assert len(which[clear].unique()) > 20
 
 
 def test_near_is_bright(opened):

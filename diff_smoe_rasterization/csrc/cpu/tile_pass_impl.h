@@ -1,0 +1,122 @@
+// One tile's share of a pass over the pixels of a rendering. Included once per instruction set.
+#pragma once
+
+#include "tile_walk_impl.h"
+
+namespace dsmoe {
+namespace cpu {
+namespace DSMOE_SIMD {
+
+template <class S, BlendMode kBlendMode, class Pass> class PassVisitor {
+ public:
+  using P = Pack<S>;
+  template <class Real> using State = typename Pass::template State<Real>;
+  using Sums = typename Pass::template Sums<P>;
+  using Record = typename Pass::template Sums<S>;
+  static constexpr BlendMode kMode = kBlendMode;
+  static constexpr bool kBackToFront = false;
+  static constexpr bool kSums = Sums::kNum > 0;
+
+  DSMOE_HD PassVisitor(const Pass& pass, Record* records, Scratch<S> scratch)
+      : pass_(pass),
+        records_(records),
+        transmittance_(scratch.pixels()),
+        gate_sum_(scratch.pixels()),
+        last_(scratch.pixels()),
+        state_(scratch.pixels()) {
+    for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
+    for (int i = 0; i < kTilePixels * (2 + State<S>::kNum); ++i) gate_sum_.values[i] = S(0);
+  }
+
+  // Starts every pixel. Returns how many entries of the list some numerator has seen.
+  DSMOE_HD int64_t begin(const Tile<S>& tile) const {
+    int64_t num_seen = 0;
+    TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
+      num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
+      if constexpr (kSums) {
+        last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
+        State<S> state = pass_.begin(index);
+        each_array([&](PixelArray<S> array, S number) { array.pixel(x, y) = number; }, state);
+      }
+    });
+    return num_seen;
+  }
+
+  DSMOE_HD void expect(uint32_t slot) const {
+    if (kSums) __builtin_prefetch(records_ + slot, 1);
+  }
+  DSMOE_HD Sums begin(const ListedGaussian<S>& gaussian) {
+    seen_ = P(gaussian.position + S(1));
+    return Sums();
+  }
+  DSMOE_HD bool wanted(int at, Mask<P>& not_past) const {
+    not_past = seen_ <= last_.load(at);
+    return !kSums || any(not_past);  // to ask costs more than a visit without sums
+  }
+
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P> not_past, Sums& sums) const {
+    PixelState<P> walked = {transmittance_.load(at), gate_sum_.load(at)};
+    State<P> state;
+    each_array([&](PixelArray<S> array, P& number) { number = array.load(at); }, state);
+    pass_.template visit<kMode>(walked, state, {pairs.gate, pairs.dx, pairs.dy, seen_, not_past}, sums);
+    transmittance_.store(at, walked.transmittance);
+    gate_sum_.store(at, walked.gate_sum);
+    if (!kSums) each_array([&](PixelArray<S> array, P number) { array.store(at, number); }, state);
+  }
+
+  DSMOE_HD void end(const ListedGaussian<S>& gaussian, const Sums& sums) const {
+    if constexpr (kSums) {
+      Sums::for_each([](S& number, P sum) { number = sum_lanes(sum); }, records_[gaussian.slot], sums);
+    }
+  }
+
+  // Ends every pixel.
+  DSMOE_HD void end(const Tile<S>& tile) const {
+    const auto gaussian_at = [&](int64_t i) { return tile.saved.instances[tile.begin + i].gaussian; };
+    TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
+      State<S> state;
+      each_array([&](PixelArray<S> array, auto& number) { number = array.pixel(x, y); }, state);
+      pass_.end(state, index, gaussian_at);
+    });
+  }
+
+ private:
+  // Calls visit(array, number) for each number of a State.
+  template <class Visit, class AnyState> DSMOE_HD void each_array(Visit visit, AnyState& state) const {
+    Scratch<S> arrays = {state_.values};
+    state.for_each([&](auto& number) { visit(arrays.pixels(), number); });
+  }
+
+  const Pass& pass_;
+  Record* const records_;  // [I] by slot; the tile's are written whole
+  const PixelArray<S> transmittance_, gate_sum_, last_;
+  const PixelArray<S> state_;  // one array a number
+  P seen_;
+};
+
+template <class S, BlendMode kMode, class Pass, class Record>
+int64_t pass_of_tile(const Tile<S>& tile, const Pass& pass, Record* records, S* memory) {
+  Scratch<S> scratch = {memory};
+  const WidePixels<kMode, S> wide(tile, scratch.pixels());
+  PassVisitor<S, kMode, Pass> visitor(pass, records, scratch);
+  const int64_t end = tile.begin + visitor.begin(tile);
+  if constexpr (Record::kNum > 0) {
+    for (int64_t i = end; i < tile.end; ++i) records[tile.saved.instances[i].slot] = Record();
+  }
+  const int64_t pairs = walk_tile(tile, tile.begin, end, 0, wide, visitor);
+  if constexpr (Record::kNum == 0) visitor.end(tile);
+  return pairs;
+}
+
+template <class S, class Pass>
+int64_t pass(const Tile<S>& tile, const Pass& pass, typename Pass::template Sums<S>* records, S* scratch) {
+  int64_t pairs = 0;
+  dispatch_blend(tile.config.blend.mode, kAnyFeatures, [&](auto mode, auto) {
+    pairs = pass_of_tile<S, decltype(mode)::value>(tile, pass, records, scratch);
+  });
+  return pairs;
+}
+
+}  // namespace DSMOE_SIMD
+}  // namespace cpu
+}  // namespace dsmoe

@@ -1,0 +1,28 @@
+// The passes over the pixels of a rendering that read no features: dsmoe/passes says what each does.
+#include "../refuse.h"
+#include "dsmoe/passes/contributions.h"
+#include "dsmoe/passes/gate_map.h"
+#include "pass.cuh"
+
+namespace dsmoe {
+namespace cuda {
+
+template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work) {
+  refuse_contributions("cuda::contributions", frame, map);
+  sum_pixels(frame, ContributionPass<S>{map}, work);
+}
+
+template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work) {
+  refuse_gate_map("cuda::gate_map", frame, map);
+  walk_tiles(frame, GateMapPass<S>{map}, work);
+}
+
+#define DSMOE_INSTANTIATE(S)                                                            \
+  template void contributions(const Frame<S>&, const ContributionMap<S>&, const Work&); \
+  template void gate_map(const Frame<S>&, const GateMap&, const Work&);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cuda
+}  // namespace dsmoe
