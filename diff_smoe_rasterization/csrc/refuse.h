@@ -45,7 +45,18 @@ template <class S> void refuse_rules(const char* function, const BlendRules<S>& 
   }
   refuse_negative(function, "alpha_min", rules.alpha_min);
   if (rules.faint_below != kFaintBelowOfMode) refuse_negative(function, "faint_below", rules.faint_below);
-  if (on_host || rules.background_gate_at == nullptr) refuse_negative(function, "background_gate", rules.lambda());
+  if (!on_host && rules.background_gate_at != nullptr) return;
+  constexpr S kMostGate = S(1e30);  // that and a background's colour still make a float32 number
+  if (rules.lambda() >= S(0) && rules.lambda() <= kMostGate) return;
+  refuse(function, "background_gate is ", rules.lambda(), "; it must be 0 to ", kMostGate);
+}
+
+// Also before memory is allocated for such an image.
+inline void refuse_image_size(const char* function, int64_t width, int64_t height) {
+  constexpr int64_t kMostPixels = std::numeric_limits<int32_t>::max();
+  if (width > 0 && height > 0 && height <= kMostPixels / width) return;
+  refuse(function, "image_width x image_height is ", width, " x ", height, "; both must be positive, and an image has ",
+         kMostPixels, " pixels or fewer");
 }
 
 // What every pass reads: the sizes, and what decides which pairs count.
@@ -56,9 +67,7 @@ template <class Frame> void refuse_frame(const char* function, const Frame& fram
   if (count < 0 || count > kMostGaussians) {
     refuse(function, "num_gaussians is ", count, "; it must be 0 to ", kMostGaussians);
   }
-  if (frame.camera.width < 1 || frame.camera.height < 1) {
-    refuse(function, "width x height is ", frame.camera.width, " x ", frame.camera.height, "; both must be positive");
-  }
+  refuse_image_size(function, frame.camera.width, frame.camera.height);
   refuse_rules(function, config.blend, kOnHost<Frame>);
   if (config.num_channels < 1) refuse(function, "num_channels is ", config.num_channels, "; it must be 1 or more");
   if (config.most_instances < 1) {
@@ -108,11 +117,12 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
   using S = std::remove_const_t<decltype(camera.near)>;
   refuse_frame(function, frame);
   refuse_inputs(function, frame.inputs, frame.config.num_channels);
-  const auto is_field_of_view = [](S tangent) { return tangent > S(0) && tangent <= std::numeric_limits<S>::max(); };
-  if (!is_field_of_view(camera.tan_fov_x) || !is_field_of_view(camera.tan_fov_y)) {
-    refuse(function, "tan_fov_x and tan_fov_y are ", camera.tan_fov_x, " and ", camera.tan_fov_y,
-           "; both must be positive and finite");
-  }
+  const auto refuse_tangent = [&](const char* name, S tangent) {
+    if (tangent > S(0) && tangent <= std::numeric_limits<S>::max()) return;
+    refuse(function, name, " is ", tangent, "; it must be positive and finite");
+  };
+  refuse_tangent("tan_fov_x (tanfovx)", camera.tan_fov_x);
+  refuse_tangent("tan_fov_y (tanfovy)", camera.tan_fov_y);
   refuse_negative(function, "near", camera.near);
   refuse_negative(function, "scale_modifier", frame.config.scale_modifier);
   refuse_negative(function, "low_pass", frame.config.low_pass);
