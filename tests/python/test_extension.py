@@ -297,6 +297,28 @@ def test_the_raw_ops_refuse_colours_without_channels(op):
 
 
 @on_every_device
+@pytest.mark.parametrize("op", ["rasterize", "radii", "project"])
+@pytest.mark.parametrize("name", ["means3D", "opacities", "bg", "viewmatrix", "projmatrix", "campos"])
+def test_the_raw_ops_refuse_absent_tensors(op, name):
+    """PyTorch hands None on where the schema asks for a tensor."""
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
+    arguments = op_arguments(scene, op, **{name: None})
+    with pytest.raises(ValueError, match=f"{op}: {name} is absent; it must be given"):
+        getattr(torch.ops.diff_smoe_rasterization, op)(*arguments)
+
+
+@on_every_device
+@pytest.mark.parametrize("name, wrong, message", [
+    ("tanfovx", 0.0, r"tan_fov_x \(tanfovx\) is 0; it must be positive and finite"),
+    ("image_width", 1 << 31, "image_width x image_height is 2147483648 x 18; both must be positive, and an image has"),
+    ("fixed_background_gate", 2e30, r"background_gate is 2e\+30; it must be 0 to 1e\+30")])
+def test_the_raw_op_has_the_values_refused_by_the_core(name, wrong, message):
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
+    with pytest.raises(ValueError, match=f"rasterize: {message}"):
+        torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene, **{name: wrong}))
+
+
+@on_every_device
 @pytest.mark.skipif(not hasattr(torch.library, "register_autograd"),
                     reason=f"torch {torch.__version__} only refuses what it sees: a loss that is not linear")
 def test_second_derivatives_of_a_linear_loss_are_refused():
