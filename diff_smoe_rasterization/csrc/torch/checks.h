@@ -1,6 +1,6 @@
 // What the ops refuse: absent tensors, shapes, types and devices, and on request what tensors hold. Values of numbers
-// are the core's (refuse.h). Errors name the function, the argument, what it is and what it must be. They are ValueError
-// for shapes and values, TypeError for types and devices.
+// are the core's (refuse.h). Errors name the function, the argument, what it is and what it must be. They are
+// ValueError for shapes and values, TypeError for types and devices.
 #pragma once
 
 #include <cstring>
