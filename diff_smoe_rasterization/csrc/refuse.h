@@ -31,6 +31,11 @@ template <class S> void refuse_negative(const char* function, const char* name, 
   refuse(function, name, " is ", value, "; it must be 0 or more and finite");
 }
 
+template <class S> void refuse_unless_positive(const char* function, const char* name, S value) {
+  if (value > S(0) && value <= std::numeric_limits<S>::max()) return;
+  refuse(function, name, " is ", value, "; it must be positive and finite");
+}
+
 // Whether the host may read what the pointers of a frame point to: where the camera holds its matrices.
 template <class Frame> constexpr bool kOnHost = !std::is_pointer_v<decltype(Frame::camera.view)>;
 
@@ -114,15 +119,10 @@ template <class S> void refuse_inputs(const char* function, const GaussianInputs
 
 template <class Frame> void refuse_projection(const char* function, const Frame& frame) {
   const auto& camera = frame.camera;
-  using S = std::remove_const_t<decltype(camera.near)>;
   refuse_frame(function, frame);
   refuse_inputs(function, frame.inputs, frame.config.num_channels);
-  const auto refuse_tangent = [&](const char* name, S tangent) {
-    if (tangent > S(0) && tangent <= std::numeric_limits<S>::max()) return;
-    refuse(function, name, " is ", tangent, "; it must be positive and finite");
-  };
-  refuse_tangent("tan_fov_x (tanfovx)", camera.tan_fov_x);
-  refuse_tangent("tan_fov_y (tanfovy)", camera.tan_fov_y);
+  refuse_unless_positive(function, "tan_fov_x (tanfovx)", camera.tan_fov_x);
+  refuse_unless_positive(function, "tan_fov_y (tanfovy)", camera.tan_fov_y);
   refuse_negative(function, "near", camera.near);
   refuse_negative(function, "scale_modifier", frame.config.scale_modifier);
   refuse_negative(function, "low_pass", frame.config.low_pass);
