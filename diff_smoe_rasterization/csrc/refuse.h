@@ -56,12 +56,9 @@ template <class S> void refuse_rules(const char* function, const BlendRules<S>& 
   refuse(function, "background_gate is ", rules.lambda(), "; it must be 0 to ", kMostGate);
 }
 
-// Also before memory is allocated for such an image.
 inline void refuse_image_size(const char* function, int64_t width, int64_t height) {
-  constexpr int64_t kMostPixels = std::numeric_limits<int32_t>::max();
-  if (width > 0 && height > 0 && height <= kMostPixels / width) return;
-  refuse(function, "image_width x image_height is ", width, " x ", height, "; both must be positive, and an image has ",
-         kMostPixels, " pixels or fewer");
+  if (width > 0 && height > 0) return;
+  refuse(function, "image_width x image_height is ", width, " x ", height, "; both must be positive");
 }
 
 // What every pass reads: the sizes, and what decides which pairs count.

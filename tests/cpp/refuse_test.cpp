@@ -29,14 +29,11 @@ template <class Frame> struct Case {
 // What is wrong with a rendering before it begins; pointers of both backends.
 template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
   static const float number = 1;
-  const std::string positive = "; both must be positive, and an image has 2147483647 pixels or fewer";
   const std::string last_mode = std::to_string(BlendModes::kSize - 1);
   return {
       {[](auto& f) { f.inputs.num_gaussians = -1; }, "num_gaussians is -1; it must be 0 to 2147483647"},
-      {[](auto& f) { f.camera.width = 0; }, "image_width x image_height is 0 x 29" + positive},
-      {[](auto& f) { f.camera.height = -4; }, "image_width x image_height is 37 x -4" + positive},
-      {[](auto& f) { f.camera.width = f.camera.height = 1 << 16; },
-       "image_width x image_height is 65536 x 65536" + positive},
+      {[](auto& f) { f.camera.width = 0; }, "image_width x image_height is 0 x 29; both must be positive"},
+      {[](auto& f) { f.camera.height = -4; }, "image_width x image_height is 37 x -4; both must be positive"},
       {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(99); },
        "blend_mode is 99; it must be 0 to " + last_mode},
       {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(-1); },

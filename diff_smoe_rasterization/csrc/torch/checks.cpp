@@ -1,5 +1,6 @@
 #include "checks.h"
 
+#include <climits>
 #include <sstream>
 #include <string>
 
@@ -34,9 +35,12 @@ void check_background_gate(const Expect& expect, const Tensor& gate) {
   if (gate.defined()) expect("background_gate", gate, gate.numel() == 1 ? shape_of(gate.sizes()) : Shape{1});
 }
 
-// The core is asked before images of that size are allocated.
+// Before images of that size are allocated.
 void check_image_size(const char* function, const Options& options) {
-  as_op(function, [&] { refuse_image_size(function, options.image_width, options.image_height); });
+  const int64_t width = options.image_width, height = options.image_height;
+  as_op(function, [&] { refuse_image_size(function, width, height); });
+  DSMOE_CHECK_VALUE(height <= INT_MAX / width, function, ": image_width x image_height is ", width, " x ", height,
+                    "; an image may have ", INT_MAX, " pixels");
 }
 
 }  // namespace
