@@ -14,8 +14,6 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
     function: the one that the caller called, which errors name.
     Every eager call comes through here, and costs what this costs: what can be looked up once is looked up below.
     """
-    if not _OUTPUTS.issuperset(outputs):
-        raise ValueError(f"{function}: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     blend_mode, background_gate = resolve_blend(settings)
     required, optional = tensor_checks(function, "means3D", means3D)
     inputs = {"means3D": means3D, "opacities": required("opacities", opacities)}
@@ -28,11 +26,13 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
     inputs["bg"] = required("bg", settings.bg)
     for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
         inputs[name] = without_batch(required(name, getattr(settings, name)), dim)
-    return [inputs.get(name) for name in INPUTS], op_options(settings, outputs, blend_mode, fixed_gate)
+    return [inputs.get(name) for name in INPUTS], op_options(function, settings, outputs, blend_mode, fixed_gate)
 
 
-def op_options(settings, outputs, blend_mode, fixed_gate):
-    """Returns the options of a rendering in the order of the op, all but the last one."""
+def op_options(function, settings, outputs, blend_mode, fixed_gate):
+    """Returns the options of a rendering in the order of the op, all but the last one. function: as above."""
+    if not _OUTPUTS.issuperset(outputs):
+        raise ValueError(f"{function}: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     options = [kind(getattr(settings, name)) for name, kind in _SETTING_OPTIONS]
     for place, name in _WHOLE_OPTIONS:
         if options[place] != getattr(settings, name):  # int() has cut digits off

@@ -16,7 +16,7 @@ import torch
 from .arguments import as_rendering, op_arguments, op_options, tensor_checks
 from .autograd import INPUTS, OPTIONS, refuse_forward_mode
 from .extension import _C
-from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
+from .settings import BLEND_MODES, GaussianRasterizationSettings, Rendering, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
 _GATE_NUMBERS = 8  # centre (2), conic (3), opacity, squared reach, depth
@@ -99,14 +99,12 @@ def projection_arguments(settings: GaussianRasterizationSettings, means3D: torch
 def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSettings,
                        outputs: Sequence[str] = ()) -> Tuple[List[Optional[torch.Tensor]], List[Any]]:
     """The tensors and the options of the op `blend`, all but the last option. Raises as `blend_footprints` does."""
-    if not set(OUTPUTS).issuperset(outputs):
-        raise ValueError(f"blend_footprints: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     blend_mode, gate = resolve_blend(settings)
     required, _ = tensor_checks("blend_footprints", "gates", footprints.gates)
     learned = isinstance(gate, torch.Tensor)
     tensors = [footprints.gates, required("features", footprints.features), required("radii", footprints.radii),
                required("bg", settings.bg), required("background_gate", gate) if learned else None]
-    return tensors, op_options(settings, outputs, blend_mode, 0.0 if learned else gate)
+    return tensors, op_options("blend_footprints", settings, outputs, blend_mode, 0.0 if learned else gate)
 
 
 def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSettings,

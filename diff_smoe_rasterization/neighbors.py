@@ -14,16 +14,7 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     Raises ValueError where the shape does not fit or a coordinate is not finite, TypeError for another type.
     """
     check_tensors("distCUDA2", points=points)
-    if points.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"distCUDA2: points is {points.dtype}; it must be torch.float32 or torch.float64")
-    if points.dim() != 2 or points.shape[1] != 3:
-        raise ValueError(f"distCUDA2: points has shape {list(points.shape)}; it must be [N, 3]")
-    points = points.detach()
-    finite = torch.isfinite(points).all(dim=1)
-    if not bool(finite.all()):
-        index = int((~finite).nonzero()[0])
-        raise ValueError(f"distCUDA2: points[{index}] is not finite")
     from .extension import _C  # noqa: F401  (loading it registers the op)
 
-    return torch.ops.diff_smoe_rasterization.mean_squared_neighbour_distances(points)
+    return torch.ops.diff_smoe_rasterization.mean_squared_neighbour_distances(points.detach())
 

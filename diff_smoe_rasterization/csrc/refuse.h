@@ -31,6 +31,11 @@ template <class S> void refuse_negative(const char* function, const char* name, 
   refuse(function, name, " is ", value, "; it must be 0 or more and finite");
 }
 
+template <class S> void refuse_unless_positive(const char* function, const char* name, S value) {
+  if (value > S(0) && value <= std::numeric_limits<S>::max()) return;
+  refuse(function, name, " is ", value, "; it must be positive and finite");
+}
+
 // Whether the host may read what the pointers of a frame point to: where the camera holds its matrices.
 template <class Frame> constexpr bool kOnHost = !std::is_pointer_v<decltype(Frame::camera.view)>;
 
@@ -45,7 +50,15 @@ template <class S> void refuse_rules(const char* function, const BlendRules<S>& 
   }
   refuse_negative(function, "alpha_min", rules.alpha_min);
   if (rules.faint_below != kFaintBelowOfMode) refuse_negative(function, "faint_below", rules.faint_below);
-  if (on_host || rules.background_gate_at == nullptr) refuse_negative(function, "background_gate", rules.lambda());
+  if (!on_host && rules.background_gate_at != nullptr) return;
+  constexpr S kMostGate = S(1e30);  // that and a background's colour still make a float32 number
+  if (rules.lambda() >= S(0) && rules.lambda() <= kMostGate) return;
+  refuse(function, "background_gate is ", rules.lambda(), "; it must be 0 to ", kMostGate);
+}
+
+inline void refuse_image_size(const char* function, int64_t width, int64_t height) {
+  if (width > 0 && height > 0) return;
+  refuse(function, "image_width x image_height is ", width, " x ", height, "; both must be positive");
 }
 
 // What every pass reads: the sizes, and what decides which pairs count.
@@ -56,9 +69,7 @@ template <class Frame> void refuse_frame(const char* function, const Frame& fram
   if (count < 0 || count > kMostGaussians) {
     refuse(function, "num_gaussians is ", count, "; it must be 0 to ", kMostGaussians);
   }
-  if (frame.camera.width < 1 || frame.camera.height < 1) {
-    refuse(function, "width x height is ", frame.camera.width, " x ", frame.camera.height, "; both must be positive");
-  }
+  refuse_image_size(function, frame.camera.width, frame.camera.height);
   refuse_rules(function, config.blend, kOnHost<Frame>);
   if (config.num_channels < 1) refuse(function, "num_channels is ", config.num_channels, "; it must be 1 or more");
   if (config.most_instances < 1) {
@@ -105,14 +116,10 @@ template <class S> void refuse_inputs(const char* function, const GaussianInputs
 
 template <class Frame> void refuse_projection(const char* function, const Frame& frame) {
   const auto& camera = frame.camera;
-  using S = std::remove_const_t<decltype(camera.near)>;
   refuse_frame(function, frame);
   refuse_inputs(function, frame.inputs, frame.config.num_channels);
-  const auto is_field_of_view = [](S tangent) { return tangent > S(0) && tangent <= std::numeric_limits<S>::max(); };
-  if (!is_field_of_view(camera.tan_fov_x) || !is_field_of_view(camera.tan_fov_y)) {
-    refuse(function, "tan_fov_x and tan_fov_y are ", camera.tan_fov_x, " and ", camera.tan_fov_y,
-           "; both must be positive and finite");
-  }
+  refuse_unless_positive(function, "tan_fov_x (tanfovx)", camera.tan_fov_x);
+  refuse_unless_positive(function, "tan_fov_y (tanfovy)", camera.tan_fov_y);
   refuse_negative(function, "near", camera.near);
   refuse_negative(function, "scale_modifier", frame.config.scale_modifier);
   refuse_negative(function, "low_pass", frame.config.low_pass);

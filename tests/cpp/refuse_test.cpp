@@ -32,8 +32,8 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
   const std::string last_mode = std::to_string(BlendModes::kSize - 1);
   return {
       {[](auto& f) { f.inputs.num_gaussians = -1; }, "num_gaussians is -1; it must be 0 to 2147483647"},
-      {[](auto& f) { f.camera.width = 0; }, "width x height is 0 x 29; both must be positive"},
-      {[](auto& f) { f.camera.height = -4; }, "width x height is 37 x -4; both must be positive"},
+      {[](auto& f) { f.camera.width = 0; }, "image_width x image_height is 0 x 29; both must be positive"},
+      {[](auto& f) { f.camera.height = -4; }, "image_width x image_height is 37 x -4; both must be positive"},
       {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(99); },
        "blend_mode is 99; it must be 0 to " + last_mode},
       {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(-1); },
@@ -42,7 +42,7 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
       {[](auto& f) { f.config.blend.alpha_min = -0.5f; }, "alpha_min is -0.5; it must be 0 or more and finite"},
       {[](auto& f) { f.config.blend.faint_below = -0.5f; }, "faint_below is -0.5; it must be 0 or more and finite"},
       {[](auto& f) { f.config.blend.background_gate_at = nullptr, f.config.blend.background_gate = -0.1f; },
-       "background_gate is -0.1; it must be 0 or more and finite"},
+       "background_gate is -0.1; it must be 0 to 1e+30"},
       {[](auto& f) { f.config.most_instances = 0; }, "most_instances is 0; it must be 1 or more"},
       {[](auto& f) { f.inputs.means3D = nullptr; }, "means3D is null; it must point to an array [N, 3]"},
       {[](auto& f) { f.inputs.opacities = nullptr; }, "opacities is null; it must point to an array [N]"},
@@ -63,8 +63,8 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
        "shs has shape [20, 4, 3]; sh_degree 2 needs 9 coefficients a Gaussian, not 4"},
       {[](auto& f) { f.inputs.dc = &number, f.inputs.num_sh = 2; },
        "shs has shape [20, 2, 3] besides dc; sh_degree 1 needs 4 coefficients a Gaussian, not 3"},
-      {[](auto& f) { f.camera.tan_fov_y = 0; },
-       "tan_fov_x and tan_fov_y are 0.6 and 0; both must be positive and finite"},
+      {[](auto& f) { f.camera.tan_fov_y = 0; }, "tan_fov_y (tanfovy) is 0; it must be positive and finite"},
+      {[](auto& f) { f.camera.tan_fov_x = HUGE_VALF; }, "tan_fov_x (tanfovx) is inf; it must be positive and finite"},
       {[](auto& f) { f.camera.near = NAN; }, "near is nan; it must be 0 or more and finite"},
       {[](auto& f) { f.config.scale_modifier = -2; }, "scale_modifier is -2; it must be 0 or more and finite"},
       {[](auto& f) { f.config.low_pass = HUGE_VALF; }, "low_pass is inf; it must be 0 or more and finite"},
@@ -85,7 +85,7 @@ TEST(Refuse, AForwardPassOnTheCpuNamesWhatIsWrong) {
   auto cases = cases_of_forward<Frame>();
   const float negative = -1;
   cases.push_back({[&](Frame& f) { f.config.blend.background_gate_at = &negative; },
-                   "background_gate is -1; it must be 0 or more and finite"});
+                   "background_gate is -1; it must be 0 to 1e+30"});
   for (const auto& c : cases) {
     Frame frame = frame_of(scene, rendering);
     c.spoil(frame);

@@ -332,7 +332,7 @@ def test_the_value_of_a_tensor_is_checked_where_nobody_waits_for_it(value, devic
     if device.type != "cpu":
         pytest.skip("the host would wait for the GPU")
     scene = random_scene("smoe_eq7", 5, 20, 18, background_gate=torch.tensor(value).double())
-    with pytest.raises(ValueError, match=f"background_gate is {value}; it must be 0 or more and finite"):
+    with pytest.raises(ValueError, match=f"background_gate is {value}; it must be 0 to 1e\\+30"):
         rasterize(settings=scene.settings, **scene.inputs)
 
 

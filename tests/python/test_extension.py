@@ -292,8 +292,31 @@ def test_the_raw_ops_refuse_colours_without_channels(op):
     """On CUDA nothing would write what the backward pass reads."""
     scene = random_scene("smoe", 20, 20, 18, channels=1, dtype=torch.float32)
     arguments = op_arguments(scene, op, colors_precomp=torch.empty(20, 0), bg=torch.empty(0))
-    with pytest.raises(ValueError, match=r"colors_precomp has shape \[20, 0\]"):
+    with pytest.raises(ValueError, match=f"{op}: num_channels is 0; it must be 1 or more"):
         getattr(torch.ops.diff_smoe_rasterization, op)(*arguments)
+
+
+@on_every_device
+@pytest.mark.parametrize("op", ["rasterize", "radii", "project"])
+@pytest.mark.parametrize("name", ["means3D", "opacities", "bg", "viewmatrix", "projmatrix", "campos"])
+def test_the_raw_ops_refuse_absent_tensors(op, name):
+    """PyTorch hands None on where the schema asks for a tensor."""
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
+    arguments = op_arguments(scene, op, **{name: None})
+    with pytest.raises(ValueError, match=f"{op}: {name} is absent; it must be given"):
+        getattr(torch.ops.diff_smoe_rasterization, op)(*arguments)
+
+
+@on_every_device
+@pytest.mark.parametrize("name, wrong, message", [
+    ("tanfovx", 0.0, r"tan_fov_x \(tanfovx\) is 0; it must be positive and finite"),
+    ("image_width", -20, "image_width x image_height is -20 x 18; both must be positive"),
+    ("image_width", 1 << 31, "image_width x image_height is 2147483648 x 18; an image may have 2147483647 pixels"),
+    ("fixed_background_gate", 2e30, r"background_gate is 2e\+30; it must be 0 to 1e\+30")])
+def test_the_raw_op_refuses_values(name, wrong, message):
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
+    with pytest.raises(ValueError, match=f"rasterize: {message}"):
+        torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene, **{name: wrong}))
 
 
 @on_every_device

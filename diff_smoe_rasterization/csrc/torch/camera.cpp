@@ -11,9 +11,9 @@ GaussianRasterizationSettings settings_from_camera(const at::Tensor& K, const at
                                                    int64_t width, int64_t height, const at::Tensor& bg,
                                                    int64_t sh_degree, double scale_modifier) {
   const char* function = "settings_from_camera";
-  binding::check_shape(function, "K", K, {3, 3});
-  binding::check_shape(function, "R", R, {3, 3});
-  binding::check_shape(function, "t", t, {3});
+  TORCH_CHECK_VALUE(binding::matches(K, {3, 3}) && binding::matches(R, {3, 3}) && binding::matches(t, {3}), function,
+                    ": K, R and t have shapes ", K.sizes(), ", ", R.sizes(), " and ", t.sizes(),
+                    "; they must be [3, 3], [3, 3] and [3]");
   const at::Tensor intrinsics = K.to(at::kDouble), rotation = R.to(at::kDouble), translation = t.to(at::kDouble);
   const double fx = intrinsics[0][0].item<double>(), fy = intrinsics[1][1].item<double>();
   const at::Tensor pinhole = intrinsics.clone();

@@ -1,12 +1,12 @@
-// What the ops refuse besides what the core does (refuse.h). Errors name the function, the argument, what it is and
-// what it must be. They are ValueError for shapes and values, TypeError for types and devices. Python does not repeat
-// these checks.
+// What the ops refuse: absent tensors, shapes, types and devices, and on request what tensors hold. Values of numbers
+// are the core's (refuse.h). Errors name the function, the argument, what it is and what it must be. They are
+// ValueError for shapes and values, TypeError for types and devices.
 #pragma once
 
 #include <cstring>
+#include <stdexcept>
 #include <string>
 #include <type_traits>
-#include <vector>
 
 #include "check_tensor.h"
 #include "tensors.h"
@@ -14,54 +14,49 @@
 namespace dsmoe {
 namespace binding {
 
-// Tensors and numbers of one rendering, before any memory is read.
-void check_arguments(const char* function, const Inputs& inputs, const Options& options);
+// What the core refuses in `body` is a ValueError, which names the op in place of the core's function. What does not
+// fit is a RuntimeError in Python; the core's own exception would be an OverflowError.
+template <class Body> void as_op(const char* function, const Body& body) {
+  try {
+    body();
+  } catch (const std::invalid_argument& error) {
+    const std::string message = error.what();
+    const size_t colon = message.find(": ");
+    DSMOE_CHECK_VALUE(false, function, colon == std::string::npos ? ": " + message : message.substr(colon));
+  } catch (const std::overflow_error& error) {
+    DSMOE_CHECK(false, error.what());
+  }
+}
 
-// The backward op's own arguments, since it can be called directly.
-void check_backward_arguments(const char* function, const Inputs& inputs, const Options& options, const Images& images,
-                              const Images& image_gradients, const InputMask& wanted);
+// Tensors and numbers of one rendering, before any memory is read.
+Expect check_arguments(const char* function, const Inputs& inputs, const Options& options);
+
+// Images that a rendering returned, and the gradients by them.
+void check_images(const Expect& expect, const Images& images, const Images& image_gradients, const ImageSizes& sizes,
+                  const Options& options);
 
 // What the op `blend` takes of the Gaussians, and the background.
 struct Footprints {
   Tensor gates, features, radii;       // [N, 8], [N, F] and [N]
   Tensor background, background_gate;  // [C], and one element or undefined
 };
-void check_footprints(const char* function, const Footprints& of, const Options& options);
+Expect check_footprints(const char* function, const Footprints& of, const Options& options);
 
-// The backward ops' own arguments.
-void check_blend_backward_arguments(const char* function, const Images& images, const Images& image_gradients,
-                                    const ImageSizes& sizes, const Tensor& like, const Options& options);
-void check_footprint_gradients(const char* function, const Tensor& records, const Tensor& dL_ddepths,
-                               const Tensor& features, const Tensor& radii, const Inputs& inputs,
-                               const Options& options);
-
-// Those of an op that goes over what a rendering saved.
-void check_contribution_arguments(const char* function, const Tensor& pixel_weights, const Tensor& radii,
-                                  const Saved& saved, const Tensor& background_gate, const Options& options);
-
-// The tensors of the op `importance` besides those of `contributions`.
-struct ImportanceImages {
-  Tensor share_weights;    // [H, W]
-  Tensor color, gate_sum;  // [C, H, W] and [1, H, W]
-  Tensor background;       // [C]
-};
-void check_importance_images(const ImportanceImages& images, const Tensor& like, const Options& options);
-
-// A tensor that a rendering returned: its shape, type and device must be as they were. shape: -1 stands for any size.
-void check_result(const char* function, const char* name, const Tensor& tensor, const std::vector<int64_t>& shape,
-                  ScalarType type, Device device);
+// What every op takes that goes over what a rendering saved.
+Expect check_score(const char* function, const Tensor& radii, const Saved& saved, const Tensor& background_gate,
+                   const Options& options);
 
 // Checks the tensors that a rendering saved, and points to them. sizes: what is -1 in them is not checked.
 template <class SavedForward, class Sizes>
-void unpack_saved(const char* function, const Saved& tensors, SavedForward& saved, const Sizes& sizes, Device device) {
+void unpack_saved(const Expect& expect, const Saved& tensors, SavedForward& saved, const Sizes& sizes) {
   size_t count = 0;
   for_each_array(saved, sizes, [&](const char*, auto*&, int64_t) { ++count; });
-  DSMOE_CHECK_VALUE(tensors.size() == count, function, ": saved has length ", tensors.size(), "; it must be ", count);
+  check_length(expect.function, "saved", tensors.size(), count);
   size_t next = 0;
   for_each_array(saved, sizes, [&](const char* name, auto*& pointer, int64_t rows) {
     const SavedArray array = saved_array(name, pointer, rows);
     const Tensor& tensor = tensors[next++];
-    check_result(function, name, tensor, saved_shape(array), scalar_type(array.type), device);
+    expect.dense(name, tensor, shape_of(saved_shape(array)), scalar_type(array.type));
     pointer = static_cast<std::remove_reference_t<decltype(pointer)>>(tensor.data_ptr());
   });
 }
@@ -76,8 +71,6 @@ template <class SavedForward> int64_t saved_length(const Saved& tensors, SavedFo
   });
   return length;
 }
-
-void check_positions(const Tensor& positions, const Tensor& viewmatrix);
 
 // Under `strict`: raises for the first Gaussian that has an attribute that is not finite. Waits for the device.
 void refuse_non_finite(const char* function, const Inputs& inputs);

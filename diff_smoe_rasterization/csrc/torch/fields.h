@@ -3,23 +3,23 @@
 // DSMOE_OPTIONS, its field to GaussianRasterizationSettings, and its use.
 #pragma once
 
-// The tensors: X(enumerator, type in the schema, name). N Gaussians, C channels.
-#define DSMOE_INPUTS(X)                                                                    \
-  X(kMeans3D, "Tensor", means3D)                 /* [N, 3] */                              \
-  X(kMeans2D, "Tensor?", means2D)                /* [N, 3]; only its gradient is of use */ \
-  X(kOpacities, "Tensor", opacities)             /* [N] or [N, 1] */                       \
-  X(kDc, "Tensor?", dc)                          /* [N, 1, 3] */                           \
-  X(kShs, "Tensor?", shs)                        /* [N, K, 3] */                           \
-  X(kColorsPrecomp, "Tensor?", colors_precomp)   /* [N, C] */                              \
-  X(kScales, "Tensor?", scales)                  /* [N, 3] */                              \
-  X(kRotations, "Tensor?", rotations)            /* [N, 4] */                              \
-  X(kCov3DPrecomp, "Tensor?", cov3D_precomp)     /* [N, 6] */                              \
-  X(kBackground, "Tensor", bg)                   /* [C] */                                 \
-  X(kViewMatrix, "Tensor", viewmatrix)           /* [4, 4] */                              \
-  X(kProjMatrix, "Tensor", projmatrix)           /* [4, 4] */                              \
-  X(kCampos, "Tensor", campos)                   /* [3] */                                 \
-  X(kBackgroundGate, "Tensor?", background_gate) /* one element; absent: a fixed number */ \
-  X(kMeans2DAbs, "Tensor?", means2D_abs)         /* [N, 2]; only its gradient is of use */
+// The tensors: X(enumerator, type in the schema, name, shape...). N Gaussians, C channels: 3 with shs.
+#define DSMOE_INPUTS(X)                                                                                       \
+  X(kMeans3D, "Tensor", means3D, "N", 3)                                                                      \
+  X(kMeans2D, "Tensor?", means2D, "N", 3)    /* only its gradient is of use */                                \
+  X(kOpacities, "Tensor", opacities, "N", 1) /* or [N] */                                                     \
+  X(kDc, "Tensor?", dc, "N", 1, 3)                                                                            \
+  X(kShs, "Tensor?", shs, "N", "K", 3)                                                                        \
+  X(kColorsPrecomp, "Tensor?", colors_precomp, "N", "C")                                                      \
+  X(kScales, "Tensor?", scales, "N", 3)                                                                       \
+  X(kRotations, "Tensor?", rotations, "N", 4)                                                                 \
+  X(kCov3DPrecomp, "Tensor?", cov3D_precomp, "N", 6)                                                          \
+  X(kBackground, "Tensor", bg, "C")                                                                           \
+  X(kViewMatrix, "Tensor", viewmatrix, 4, 4)                                                                  \
+  X(kProjMatrix, "Tensor", projmatrix, 4, 4)                                                                  \
+  X(kCampos, "Tensor", campos, 3)                                                                             \
+  X(kBackgroundGate, "Tensor?", background_gate, 1) /* in any number of dimensions; absent: a fixed number */ \
+  X(kMeans2DAbs, "Tensor?", means2D_abs, "N", 2)    /* only its gradient is of use */
 
 // The others: X(type in C++, type in the schema, name). They mean what the field of that name means in settings.py.
 // for_backward stays the last one: callers in Python append it.

@@ -5,7 +5,6 @@
 
 #include <algorithm>
 #include <iterator>
-#include <stdexcept>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -19,13 +18,9 @@ namespace binding {
 inline Inputs read_inputs(Arguments& arguments) {
   Inputs inputs;
   const auto read = [&](std::string_view schema, Tensor& value) {
-    if (schema == "Tensor?") {
-      arguments.read_optional(value);
-    } else {
-      arguments.read(value);
-    }
+    schema == "Tensor?" ? arguments.read_optional(value) : arguments.read(value);
   };
-#define DSMOE_READ(enumerator, schema, name) read(schema, inputs[enumerator]);
+#define DSMOE_READ(enumerator, schema, name, ...) read(schema, inputs[enumerator]);
   DSMOE_INPUTS(DSMOE_READ)
 #undef DSMOE_READ
   return inputs;
@@ -45,19 +40,9 @@ inline Tensor read_optional(Arguments& arguments) {
   return value;
 }
 
-// Calls body(S()) with the type of `like`. What the core refuses is a ValueError, which names the op in place of the
-// core's function, if that is named. What does not fit is a RuntimeError in Python; the core's own exception would be
-// an OverflowError.
+// Calls body(S()) with the type of `like`, as the op `function`.
 template <class Body> void dispatch(const char* function, const Tensor& like, Body body) {
-  try {
-    dispatch_real(like, body);
-  } catch (const std::invalid_argument& error) {
-    const std::string message = error.what();
-    const size_t colon = message.find(": ");
-    DSMOE_CHECK_VALUE(false, function, colon == std::string::npos ? ": " + message : message.substr(colon));
-  } catch (const std::overflow_error& error) {
-    DSMOE_CHECK(false, error.what());
-  }
+  as_op(function, [&] { dispatch_real(like, body); });
 }
 
 // What an op that projects asks of the values of its arguments. Returns them dense.
@@ -125,10 +110,6 @@ template <class Backend> void radii(Arguments& arguments) {
   arguments.give_back(images[kRadii]);
 }
 
-inline void check_length(const char* function, const char* name, size_t length, size_t expected) {
-  DSMOE_CHECK_VALUE(length == expected, function, ": ", name, " has length ", length, "; it must be ", expected);
-}
-
 // Reads the gradients by the images, and makes them dense.
 inline Images read_image_gradients(Arguments& arguments) {
   Images gradients;
@@ -148,9 +129,6 @@ struct PresentInputs {
   Inputs spread(const char* function) const {
     check_length(function, "present", present.size(), kNumInputs);
     check_length(function, "inputs", list.size(), std::count(present.begin(), present.end(), true));
-    for (Input i : {kMeans3D, kOpacities, kBackground, kViewMatrix, kProjMatrix, kCampos}) {
-      DSMOE_CHECK_VALUE(present[i], function, ": ", kInputNames[i], " is absent; it must be given");
-    }
     Inputs inputs;
     auto next = list.begin();
     for (int i = 0; i < kNumInputs; ++i) {
@@ -172,17 +150,14 @@ inline InputMask to_mask(const char* function, const std::vector<bool>& list) {
 }
 
 // The gradients that the caller has memory for, spread over the inputs that want one.
-inline Inputs given_gradients(const char* function, const Inputs& inputs, const InputMask& wanted,
+inline Inputs given_gradients(const Expect& expect, const Inputs& inputs, const InputMask& wanted,
                               const Tensors& list) {
-  check_length(function, "gradients", list.size(), std::count(wanted.begin(), wanted.end(), true));
+  check_length(expect.function, "gradients", list.size(), std::count(wanted.begin(), wanted.end(), true));
   Inputs gradients;
   auto next = list.begin();
   for (int i = 0; i < kNumInputs; ++i) {
     if (!wanted[i]) continue;
-    const std::string name = std::string("the gradient of ") + kInputNames[i];
-    check_same_shape(function, name.c_str(), *next, kInputNames[i], inputs[i]);
-    check_like(function, name.c_str(), *next, "means3D", inputs[kMeans3D]);
-    check_contiguous(function, name.c_str(), *next);
+    expect.dense(std::string("the gradient of ") + kInputNames[i], *next, shape_of(inputs[i].sizes()));
     gradients[i] = *next++;
   }
   return gradients;
@@ -204,7 +179,13 @@ template <class Backend, bool kSeen> void rasterize_backward(Arguments& argument
   Images images;
   std::copy(image_list.begin(), image_list.end(), images.begin());
 
-  check_backward_arguments(function, given, options, images, image_gradients, wanted);
+  const Expect expect = check_arguments(function, given, options);
+  check_images(expect, images, image_gradients, image_sizes(given), options);
+  expect.dense("radii", images[kRadii], {num_gaussians(given)}, kInt);
+  for (int i = 0; i < kNumInputs; ++i) {
+    DSMOE_CHECK_VALUE(!wanted[i] || given[i].defined(), function, ": the gradient of ", kInputNames[i],
+                      " is wanted, but that input is absent");
+  }
   const typename Backend::Guard guard(given[kMeans3D].device());
   if (options.debug) {
     for (Image image : kDifferentiable) {
@@ -214,12 +195,13 @@ template <class Backend, bool kSeen> void rasterize_backward(Arguments& argument
   const Inputs inputs = contiguous(given);
   Inputs gradients;
   if constexpr (kSeen) {
-    gradients = given_gradients(function, given, wanted, written);
+    gradients = given_gradients(expect, given, wanted, written);
   } else {
     gradients = allocate_gradients(inputs, wanted);
   }
   dispatch(function, inputs[kMeans3D], [&](auto zero) {
-    Backend::template backward<decltype(zero)>(inputs, options, images, saved, image_gradients, gradients, kSeen);
+    Backend::template backward<decltype(zero)>(expect, inputs, options, images, saved, image_gradients, gradients,
+                                               kSeen);
   });
   if constexpr (kSeen) {
     note_change(written);
@@ -300,18 +282,19 @@ template <class Backend> void blend_backward(Arguments& arguments) {
   if (of.gates.dim() == 2 && of.features.numel() == of.gates.size(0) * columns) {
     of.features = of.features.view({of.gates.size(0), columns}).narrow(1, 0, num_features);
   }
-  check_footprints(function, of, options);
+  const Expect expect = check_footprints(function, of, options);
   const ImageSizes sizes = {of.gates.size(0), of.background.numel()};
   Images images;
   for (size_t i = 0; i < image_list.size(); ++i) images[kDifferentiable[i]] = image_list[i];
-  check_blend_backward_arguments(function, images, image_gradients, sizes, of.gates, options);
+  check_images(expect, images, image_gradients, sizes, options);
   const typename Backend::Guard guard(of.gates.device());
   images[kRadii] = of.radii = of.radii.contiguous();
   of.background = of.background.contiguous();
   const Tensor records = empty({sizes.num_gaussians, kNumGateGradients + num_features}, of.gates);
   const Tensor background = empty({wants_background ? sizes.num_channels + 1 : 0}, of.gates);
   dispatch(function, of.gates, [&](auto zero) {
-    Backend::template blend_backward<decltype(zero)>(of, options, images, saved, image_gradients, records, background);
+    Backend::template blend_backward<decltype(zero)>(expect, of, options, images, saved, image_gradients, records,
+                                                     background);
   });
   const int64_t channels = wants_background ? sizes.num_channels : 0;
   arguments.give_back(records, background.narrow(0, 0, channels).clone(),
@@ -330,8 +313,12 @@ template <class Backend> void project_backward(Arguments& arguments) {
   const Inputs given = present.spread(function);
   const InputMask wanted = to_mask(function, wanted_list);
   const Tensor records = given_records.contiguous();
-  check_arguments(function, given, options);
-  check_footprint_gradients(function, records, dL_ddepths, features, radii, given, options);
+  const Expect expect = check_arguments(function, given, options);
+  const int64_t count = num_gaussians(given), num_features = num_channels(given) + num_further_features(options);
+  expect("records", records, {count, kNumGateGradients + num_features});
+  expect("features", features, {count, num_features});
+  expect.dense("radii", radii, {count}, kInt);
+  if (dL_ddepths.defined()) expect("dL_ddepths", dL_ddepths, {count});
   for (int i = 0; i < kNumInputs; ++i) {
     DSMOE_CHECK_VALUE(
         !wanted[i] || (given[i].defined() && i != kBackground && i != kBackgroundGate && i != kMeans2DAbs), function,
@@ -358,7 +345,8 @@ template <class Backend> void contributions(Arguments& arguments) {
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  check_contribution_arguments("contributions", pixel_weights, radii, saved, background_gate, options);
+  const Expect expect = check_score("contributions", radii, saved, background_gate, options);
+  expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
   const typename Backend::Guard guard(radii.device());
   const auto real = [&] { return empty({radii.numel()}, pixel_weights); };
   const Tensor weights = real(), pixels = empty_like(radii), blend_weights = real(), distances = real();
@@ -370,43 +358,46 @@ template <class Backend> void contributions(Arguments& arguments) {
     sums.pixels = mutable_data<int32_t>(pixels);
     sums.blend_weights = mutable_data<S>(blend_weights);
     sums.distances = mutable_data<S>(distances);
-    Backend::template contributions<S>(map, radii, saved, blend_config<S>(background_gate, options), options, sums);
+    Backend::template contributions<S>(expect, map, radii, saved, blend_config<S>(background_gate, options), options,
+                                       sums);
   });
   arguments.give_back(weights, pixels, blend_weights, distances);
 }
 
 template <class Backend> void importance(Arguments& arguments) {
   const auto pixel_weights = arguments.read<Tensor>();
-  ImportanceImages images;
-  for (auto* image : {&images.share_weights, &images.color, &images.gate_sum, &images.background})
-    arguments.read(*image);
+  Tensor share_weights, color, gate_sum, background;
+  for (auto* image : {&share_weights, &color, &gate_sum, &background}) arguments.read(*image);
   const auto radii = arguments.read<Tensor>();
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  check_contribution_arguments("importance", pixel_weights, radii, saved, background_gate, options);
-  check_importance_images(images, saved[0], options);
+  const Expect expect = check_score("importance", radii, saved, background_gate, options);
+  expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
+  const int64_t height = options.image_height, width = options.image_width;
+  expect("share_weights", share_weights, {height, width});
+  expect("color", color, {"C", height, width});
+  expect("gate_sum", gate_sum, {1, height, width});
+  expect("bg", background, {color.size(0)});
   const typename Backend::Guard guard(radii.device());
   const auto sums = [&] { return empty({radii.numel()}, pixel_weights); };
   const Tensor shares = sums(), squared_shares = sums(), removal_costs = sums();
   const Tensor weights = pixel_weights.contiguous();
-  for (auto* image : {&images.share_weights, &images.color, &images.gate_sum, &images.background}) {
-    *image = image->contiguous();
-  }
+  for (auto* image : {&share_weights, &color, &gate_sum, &background}) *image = image->contiguous();
   dispatch("importance", weights, [&](auto zero) {
     using S = decltype(zero);
     RasterConfig<S> config = blend_config<S>(background_gate, options);
-    config.num_channels = static_cast<int>(images.color.size(0));
-    config.background = data<S>(images.background);
+    config.num_channels = static_cast<int>(color.size(0));
+    config.background = data<S>(background);
     ask_for_features(config, options);
     ImportanceMap<S> map;
-    map.color = data<S>(images.color);
+    map.color = data<S>(color);
     map.pixel_weights = data<S>(weights);
-    map.share_weights = data<S>(images.share_weights);
+    map.share_weights = data<S>(share_weights);
     map.sums.shares = mutable_data<S>(shares);
     map.sums.squared_shares = mutable_data<S>(squared_shares);
     map.sums.removal_costs = mutable_data<S>(removal_costs);
-    Backend::template importance<S>(images.gate_sum, radii, saved, config, options, map);
+    Backend::template importance<S>(expect, gate_sum, radii, saved, config, options, map);
   });
   arguments.give_back(shares, squared_shares, removal_costs);
 }
@@ -416,35 +407,34 @@ template <class Backend> void gate_map(Arguments& arguments) {
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  check_contribution_arguments("gate_map", Tensor(), radii, saved, background_gate, options);
+  const Expect expect = check_score("gate_map", radii, saved, background_gate, options);
   const typename Backend::Guard guard(radii.device());
   const auto image = [&] { return empty({options.image_height, options.image_width}, radii, kInt); };
   const Tensor gaussians = image(), counts = image();
   dispatch("gate_map", saved[0], [&](auto zero) {
     using S = decltype(zero);
     const GateMap map = {mutable_data<int32_t>(gaussians), mutable_data<int32_t>(counts)};
-    Backend::template gate_map<S>(radii, saved, blend_config<S>(background_gate, options), options, map);
+    Backend::template gate_map<S>(expect, radii, saved, blend_config<S>(background_gate, options), options, map);
   });
   arguments.give_back(gaussians, counts);
 }
 
 template <class Backend>
 Tensor pack_footprints(const Tensor& gates, const Tensor& features, const Tensor& radii, const Tensor& visible) {
-  const char* function = "pack_footprints";
-  DSMOE_CHECK_TYPE(gates.scalar_type() == kFloat, function, ": gates is ", dtype_name(gates.scalar_type()),
-                   "; it must be float32");
-  check_shape(function, "gates", gates, {"N", kProjectedGaussianSize});
-  check_like(function, "features", features, "gates", gates);
-  check_shape(function, "features", features, {gates.size(0), "F"});
-  check_result(function, "radii", radii, {gates.size(0)}, kInt, gates.device());
-  check_result(function, "visible", visible, {visible.numel()}, kLong, gates.device());
+  const Expect expect("pack_footprints", "gates", gates);
+  expect("gates", gates, {"N", kProjectedGaussianSize}, kFloat);
+  expect("features", features, {gates.size(0), "F"});
+  expect.dense("radii", radii, {gates.size(0)}, kInt);
+  expect.dense("visible", visible, {"M"}, kLong);
   const typename Backend::Guard guard(gates.device());
   return Backend::pack_footprints(gates, features, radii, visible);
 }
 
 template <class Backend> Tensor mark_visible(const Tensor& positions, const Tensor& viewmatrix, double near) {
+  const Expect expect("markVisible", "positions", positions);
+  expect("positions", positions, {"N", 3});
+  expect("viewmatrix", viewmatrix, {4, 4});
   const typename Backend::Guard guard(positions.device());
-  check_positions(positions, viewmatrix);
   return Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), near);
 }
 

@@ -71,10 +71,11 @@ struct Cpu {
   }
 
   template <class S>
-  static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
-                             const Images& image_gradient_tensors, const Tensor& records, const Tensor& background) {
+  static void blend_backward(const Expect& expect, const Footprints& of, const Options& options, const Images& images,
+                             const Saved& saved, const Images& image_gradient_tensors, const Tensor& records,
+                             const Tensor& background) {
     auto own = frame_of_footprints<S>(of, options, images);
-    own.saved = unpack<S>("blend_backward", saved, cpu::saved_sizes(own), of.gates.device());
+    own.saved = unpack<S>(expect, saved, cpu::saved_sizes(own));
     set_sums(own.saved, cpu::saved_sizes(own), own.images.gate_sum);
     cpu::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
@@ -98,22 +99,21 @@ struct Cpu {
   }
 
   // Checks what a rendering saved, and points to it.
-  template <class S>
-  static SavedForward<S> unpack(const char* function, const Saved& tensors, SavedSizes sizes, Device device) {
+  template <class S> static SavedForward<S> unpack(const Expect& expect, const Saved& tensors, SavedSizes sizes) {
     SavedForward<S> saved;
-    unpack_saved(function, tensors, saved, sizes, device);
+    unpack_saved(expect, tensors, saved, sizes);
     sizes.num_instances =
         saved_length(tensors, saved, "instances") > 0 ? saved.instance_offsets[sizes.num_gaussians] : 0;
-    unpack_saved(function, tensors, saved, sizes, device);
+    unpack_saved(expect, tensors, saved, sizes);
     return saved;
   }
 
   template <class S>
-  static void backward(const Inputs& inputs, const Options& options, const Images& images, const Saved& saved,
-                       const Images& image_gradient_tensors, const Inputs& gradient_tensors, bool seen_only) {
+  static void backward(const Expect& expect, const Inputs& inputs, const Options& options, const Images& images,
+                       const Saved& saved, const Images& image_gradient_tensors, const Inputs& gradient_tensors,
+                       bool seen_only) {
     auto own = frame_of_gaussians<S>(inputs, options, images);
-    const char* function = seen_only ? "rasterize_backward_seen" : "rasterize_backward";
-    own.saved = unpack<S>(function, saved, cpu::saved_sizes(own), inputs[kMeans3D].device());
+    own.saved = unpack<S>(expect, saved, cpu::saved_sizes(own));
     set_sums(own.saved, cpu::saved_sizes(own), own.images.gate_sum);
     cpu::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
@@ -137,32 +137,32 @@ struct Cpu {
 
   // The same with what it saved, for passes that read no features.
   template <class S>
-  static cpu::Frame<S> walked(const char* function, const Tensor& radii, const Saved& saved,
+  static cpu::Frame<S> walked(const Expect& expect, const Tensor& radii, const Saved& saved,
                               const RasterConfig<S>& config, const Options& options) {
     auto own = frame_of_rendering<S>(radii, config, options);
     SavedSizes sizes = cpu::saved_sizes(own);
     sizes.num_features = -1;
-    own.saved = unpack<S>(function, saved, sizes, radii.device());
+    own.saved = unpack<S>(expect, saved, sizes);
     return own;
   }
 
   template <class S>
-  static void contributions(const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
+  static void contributions(const Expect& expect, const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
-    cpu::contributions(walked<S>("contributions", radii, saved, config, options), {data<S>(pixel_weights), sums});
+    cpu::contributions(walked<S>(expect, radii, saved, config, options), {data<S>(pixel_weights), sums});
   }
 
   template <class S>
-  static void gate_map(const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
+  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
                        const GateMap& map) {
-    cpu::gate_map(walked<S>("gate_map", radii, saved, config, options), map);
+    cpu::gate_map(walked<S>(expect, radii, saved, config, options), map);
   }
 
   template <class S>
-  static void importance(const Tensor& gate_sum, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
-                         const Options& options, const ImportanceMap<S>& map) {
+  static void importance(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
+                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
     auto own = frame_of_rendering<S>(radii, config, options);
-    own.saved = unpack<S>("importance", saved, cpu::saved_sizes(own), radii.device());
+    own.saved = unpack<S>(expect, saved, cpu::saved_sizes(own));
     set_sums(own.saved, cpu::saved_sizes(own), mutable_data<S>(gate_sum));
     cpu::importance(own, map);
   }

@@ -76,12 +76,13 @@ struct Cuda {
   }
 
   template <class S>
-  static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
-                             const Images& image_gradient_tensors, const Tensor& records, const Tensor& background) {
+  static void blend_backward(const Expect& expect, const Footprints& of, const Options& options, const Images& images,
+                             const Saved& saved, const Images& image_gradient_tensors, const Tensor& records,
+                             const Tensor& background) {
     auto own = frame_of_footprints<S>(of, options, images);
     StageRecorder recorder(Pass::kBackward);
     const cuda::Run how = run(options, recorder.times());
-    own.saved = unpack<S>("blend_backward", saved, cuda::saved_sizes(own, how), of.gates.device());
+    own.saved = unpack<S>(expect, saved, cuda::saved_sizes(own, how));
     set_sums(own.saved, cuda::saved_sizes(own, how), own.images.gate_sum);
     cuda::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
@@ -109,24 +110,23 @@ struct Cuda {
 
   // Checks what a rendering saved, and points to it. The capacity, and whether there are segments, is what it has.
   template <class S>
-  static cuda::SavedForward<S> unpack(const char* function, const Saved& tensors, cuda::SavedSizes sizes,
-                                      Device device) {
+  static cuda::SavedForward<S> unpack(const Expect& expect, const Saved& tensors, cuda::SavedSizes sizes) {
     cuda::SavedForward<S> saved;
     sizes.segments = saved_length(tensors, saved, "segments") > 0;
     sizes.capacity = saved_length(tensors, saved, "instances");
-    unpack_saved(function, tensors, saved, sizes, device);
+    unpack_saved(expect, tensors, saved, sizes);
     complete(saved, sizes);
     return saved;
   }
 
   template <class S>
-  static void backward(const Inputs& inputs, const Options& options, const Images& images, const Saved& saved,
-                       const Images& image_gradient_tensors, const Inputs& gradient_tensors, bool seen_only) {
+  static void backward(const Expect& expect, const Inputs& inputs, const Options& options, const Images& images,
+                       const Saved& saved, const Images& image_gradient_tensors, const Inputs& gradient_tensors,
+                       bool seen_only) {
     auto own = frame_of_gaussians<S>(inputs, options, images);
     StageRecorder recorder(Pass::kBackward);
     const cuda::Run how = run(options, recorder.times());
-    const char* function = seen_only ? "rasterize_backward_seen" : "rasterize_backward";
-    own.saved = unpack<S>(function, saved, cuda::saved_sizes(own, how), inputs[kMeans3D].device());
+    own.saved = unpack<S>(expect, saved, cuda::saved_sizes(own, how));
     set_sums(own.saved, cuda::saved_sizes(own, how), own.images.gate_sum);
     cuda::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
@@ -148,36 +148,36 @@ struct Cuda {
 
   // The same with what it saved, for passes that read no features.
   template <class S>
-  static cuda::Frame<S> walked(const char* function, const Tensor& radii, const Saved& saved,
+  static cuda::Frame<S> walked(const Expect& expect, const Tensor& radii, const Saved& saved,
                                const RasterConfig<S>& config, const Options& options) {
     auto own = frame_of_rendering<S>(radii, config, options);
     auto sizes = cuda::saved_sizes(own, run(options, nullptr));
     sizes.num_features = -1;
-    own.saved = unpack<S>(function, saved, sizes, radii.device());
+    own.saved = unpack<S>(expect, saved, sizes);
     return own;
   }
 
   template <class S>
-  static void contributions(const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
+  static void contributions(const Expect& expect, const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
     TensorMemory memory(pixel_weights);
-    cuda::contributions(walked<S>("contributions", radii, saved, config, options), {data<S>(pixel_weights), sums},
+    cuda::contributions(walked<S>(expect, radii, saved, config, options), {data<S>(pixel_weights), sums},
                         {current_stream(), &memory, nullptr, options.deterministic});
   }
 
   template <class S>
-  static void gate_map(const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
+  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
                        const GateMap& map) {
     TensorMemory memory(radii);
-    cuda::gate_map(walked<S>("gate_map", radii, saved, config, options), map, {current_stream(), &memory});
+    cuda::gate_map(walked<S>(expect, radii, saved, config, options), map, {current_stream(), &memory});
   }
 
   template <class S>
-  static void importance(const Tensor& gate_sum, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
-                         const Options& options, const ImportanceMap<S>& map) {
+  static void importance(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
+                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
     auto own = frame_of_rendering<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
-    own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
+    own.saved = unpack<S>(expect, saved, cuda::saved_sizes(own, how));
     set_sums(own.saved, cuda::saved_sizes(own, how), mutable_data<S>(gate_sum));
     TensorMemory memory(gate_sum);
     cuda::importance(own, map, {how.stream, &memory, nullptr, how.deterministic});

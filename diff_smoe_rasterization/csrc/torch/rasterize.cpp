@@ -18,8 +18,6 @@ using binding::kNumInputs;
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-constexpr double kMaxBackgroundGate = 1e30;  // that and a background's colour still make a float32 number
-
 // The settings, with what the op takes under a name of the settings but as something else.
 struct Given : GaussianRasterizationSettings {
   using Settings = GaussianRasterizationSettings;
@@ -80,8 +78,6 @@ void Given::resolve_blend() {
     background_gate = gate->tensor;
     return;
   }
-  TORCH_CHECK_VALUE(0 <= gate->number && gate->number <= kMaxBackgroundGate, "rasterize: background_gate is ",
-                    gate->number, "; it must be a number, 0 or more and at most ", kMaxBackgroundGate);
   fixed_background_gate = gate->number;
   if (is_one && Settings::blend_mode == Blend<BlendMode::kSmoeEq7>::kName) {
     blend_mode = static_cast<int64_t>(BlendMode::kAlpha);
@@ -99,14 +95,10 @@ Inputs gather(const at::Tensor& means3D, const at::Tensor& opacities, const Give
   all.projmatrix = given.projmatrix, all.campos = given.campos, all.background_gate = given.background_gate;
   Inputs inputs;
   const auto add = [&](int index, std::string_view schema, const at::Tensor& tensor) {
-    if (schema == "Tensor") {
-      TORCH_CHECK_VALUE(tensor.defined(), "rasterize: ", binding::kInputNames[index], " is undefined");
-    } else if (!tensor.defined() || (tensor.numel() == 0 && (means3D.numel() > 0 || tensor.dim() == 1))) {
-      return;
-    }
-    inputs[index] = tensor;
+    const bool may_be_absent = schema == "Tensor?" && tensor.defined() && tensor.numel() == 0;
+    if (!may_be_absent || (means3D.numel() == 0 && tensor.dim() != 1)) inputs[index] = tensor;
   };
-#define DSMOE_ADD(enumerator, schema, name) add(binding::enumerator, schema, all.name);
+#define DSMOE_ADD(enumerator, schema, name, ...) add(binding::enumerator, schema, all.name);
   DSMOE_INPUTS(DSMOE_ADD)
 #undef DSMOE_ADD
   return inputs;

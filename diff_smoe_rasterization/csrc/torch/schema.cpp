@@ -5,7 +5,7 @@
 
 namespace {
 
-#define DSMOE_ARGUMENT(first, schema, name) schema " " #name ", "
+#define DSMOE_ARGUMENT(first, schema, name, ...) schema " " #name ", "
 const std::string kInputs = DSMOE_INPUTS(DSMOE_ARGUMENT);
 const std::string kOptions = DSMOE_OPTIONS(DSMOE_ARGUMENT);
 #undef DSMOE_ARGUMENT

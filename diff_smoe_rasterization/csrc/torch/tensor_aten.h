@@ -80,12 +80,12 @@ class Arguments {
   Arguments(const c10::OperatorHandle& op, torch::jit::Stack& stack)
       : stack_(stack), begin_(stack.size() - op.schema().arguments().size()), next_(begin_) {}
 
-  void read(Tensor& value) { value = next().toTensor(); }
   void read(OptionalTensor& value) { value = next().toOptional<Tensor>(); }
-  void read_optional(Tensor& value) {  // undefined where it is None
+  void read(Tensor& value) {  // undefined where it is None
     const c10::IValue& argument = next();
     value = argument.isNone() ? Tensor() : argument.toTensor();
   }
+  void read_optional(Tensor& value) { read(value); }
   void read(int64_t& value) { value = next().toInt(); }
   void read(double& value) { value = next().toDouble(); }
   void read(bool& value) { value = next().toBool(); }

@@ -16,7 +16,7 @@ namespace dsmoe {
 namespace binding {
 
 #define DSMOE_ENUMERATOR(enumerator, ...) enumerator,
-#define DSMOE_NAME_OF_INPUT(enumerator, schema, name) #name,
+#define DSMOE_NAME_OF_INPUT(enumerator, schema, name, ...) #name,
 #define DSMOE_NAME_OF_IMAGE(enumerator, name) #name,
 
 // The tensors that a rendering depends on, in the order of the ops' arguments.
@@ -145,14 +145,18 @@ inline int to_int(int64_t value) {
 template <class S> GaussianInputs<S> gaussian_inputs(const Inputs& inputs, const Options& options) {
   GaussianInputs<S> out;
   out.num_gaussians = num_gaussians(inputs);
-  out.means3D = data<S>(inputs[kMeans3D]);
-  out.opacities = data<S>(inputs[kOpacities]);
-  out.scales = data<S>(inputs[kScales]);
-  out.rotations = data<S>(inputs[kRotations]);
-  out.cov3D_precomp = data<S>(inputs[kCov3DPrecomp]);
-  out.colors_precomp = data<S>(inputs[kColorsPrecomp]);
-  out.dc = data<S>(inputs[kDc]);
-  out.shs = data<S>(inputs[kShs]);
+  static const S none = 0;
+  const auto array = [&](Input i) {  // not null where it is given, be it without elements
+    return out.num_gaussians == 0 && inputs[i].defined() ? &none : data<S>(inputs[i]);
+  };
+  out.means3D = array(kMeans3D);
+  out.opacities = array(kOpacities);
+  out.scales = array(kScales);
+  out.rotations = array(kRotations);
+  out.cov3D_precomp = array(kCov3DPrecomp);
+  out.colors_precomp = array(kColorsPrecomp);
+  out.dc = array(kDc);
+  out.shs = array(kShs);
   out.num_sh = inputs[kShs].defined() ? to_int(inputs[kShs].size(1)) : 0;
   out.sh_degree = to_int(options.sh_degree);
   return out;

@@ -19,65 +19,37 @@
 namespace dsmoe {
 namespace binding {
 
-inline std::string item_name(const char* list, size_t i) { return std::string(list) + "[" + std::to_string(i) + "]"; }
-
-// A list that must have a dense tensor for each parameter, of its shape, type and device.
-inline void check_like_parameters(const char* function, const char* list, const Tensors& tensors,
-                                  const Tensors& parameters) {
-  DSMOE_CHECK_VALUE(tensors.size() == parameters.size(), function, ": ", list, " has length ", tensors.size(),
-                    "; it must be ", parameters.size());
-  for (size_t i = 0; i < tensors.size(); ++i) {
-    const std::string name = item_name(list, i);
-    check_same_shape(function, name.c_str(), tensors[i], item_name("parameters", i).c_str(), parameters[i]);
-    check_like(function, name.c_str(), tensors[i], "parameters[0]", parameters[0]);
-    check_contiguous(function, name.c_str(), tensors[i]);
-  }
-}
-
-// Radii [N], or another number of each row.
-inline void check_row_numbers(const char* function, const char* name, const Tensor& numbers, const Tensor& like) {
-  check_shape(function, name, numbers, {like.size(0)});
-  check_type(function, name, numbers, kInt);
-  check_device(function, name, numbers, "its parameters", like);
-  check_contiguous(function, name, numbers);
-}
-
 template <class Backend>
 void adam(const Tensors& parameters, const Tensors& gradients, const Tensors& moments, const Tensors& squares,
           const std::vector<double>& rates, const std::vector<double>& root_scales, double beta1, double beta2,
           double epsilon, const OptionalTensor& visible) {
   const char* function = "adam";
   const size_t count = parameters.size();
-  for (size_t length : {gradients.size(), moments.size(), squares.size(), rates.size(), root_scales.size()}) {
-    DSMOE_CHECK_VALUE(length == count, function, ": lists of ", count, " and of ", length,
-                      " items are given; all must have the length of parameters");
-  }
+  check_length(function, "gradients", gradients.size(), count);
+  check_length(function, "rates", rates.size(), count);
+  check_length(function, "root_scales", root_scales.size(), count);
   if (count == 0) return;
   const Tensor& first = parameters[0];
-  check_real(function, "parameters[0]", first);
-  check_like_parameters(function, "parameters", parameters, parameters);
-  check_like_parameters(function, "moments", moments, parameters);
-  check_like_parameters(function, "squares", squares, parameters);
+  const Expect expect(function, "parameters[0]", first);
+  expect.dense_alike("parameters", parameters, parameters);
+  expect.dense_alike("moments", moments, parameters);
+  expect.dense_alike("squares", squares, parameters);
   const DeviceGuard guard(first.device());
 
   Tensor flags;
   if (visible.has_value()) {
+    expect("visible", *visible, {"N"}, kBool);
     flags = visible->contiguous();
-    check_type(function, "visible", flags, kBool);
-    check_shape(function, "visible", flags, {"N"});
-    check_device(function, "visible", flags, "parameters[0]", first);
   }
 
   Tensors dense_gradients;
   for (size_t i = 0; i < count; ++i) {
-    const std::string name = item_name("gradients", i), parameter = item_name("parameters", i);
-    check_same_shape(function, name.c_str(), gradients[i], parameter.c_str(), parameters[i]);
-    check_like(function, name.c_str(), gradients[i], "parameters[0]", first);
     DSMOE_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)), function,
-                      ": ", parameter, " has shape ", parameters[i].sizes(), "; visible has ",
+                      ": ", item_name("parameters", i), " has shape ", parameters[i].sizes(), "; visible has ",
                       flags.defined() ? flags.size(0) : 0, " rows, and so must every parameter");
     dense_gradients.push_back(gradients[i].contiguous());
   }
+  expect.dense_alike("gradients", dense_gradients, parameters);
 
   dispatch_real(first, [&](auto zero) {
     using scalar_t = decltype(zero);
@@ -108,20 +80,18 @@ void lazy_adam_catch_up(const Tensors& parameters, const Tensors& moments, const
   DSMOE_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors, function, ": ", count,
                     " parameters are given; it must be 1 to ", kLazyAdamMaxTensors);
   const Tensor& first = parameters[0];
-  check_real(function, "parameters[0]", first);
-  check_like_parameters(function, "parameters", parameters, parameters);
-  check_like_parameters(function, "moments", moments, parameters);
-  check_like_parameters(function, "squares", squares, parameters);
-  check_like_parameters(function, "gradients", gradients, parameters);
+  const Expect expect(function, "parameters[0]", first);
+  expect.dense_alike("parameters", parameters, parameters);
+  expect.dense_alike("moments", moments, parameters);
+  expect.dense_alike("squares", squares, parameters);
+  expect.dense_alike("gradients", gradients, parameters);
   for (const Tensor& parameter : parameters) {
     DSMOE_CHECK_VALUE(parameter.dim() > 0 && parameter.size(0) == first.size(0), function, ": a parameter has shape ",
                       parameter.sizes(), "; all must have the rows of the first, ", first.sizes());
   }
-  check_row_numbers(function, "marks", marks, first);
-  if (radii.has_value()) check_row_numbers(function, "radii", *radii, first);
-  check_shape(function, "rates", rates, {"capacity", count, 2});
-  check_like(function, "rates", rates, "parameters[0]", first);
-  check_contiguous(function, "rates", rates);
+  expect.dense("marks", marks, {first.size(0)}, kInt);
+  if (radii.has_value()) expect.dense("radii", *radii, {first.size(0)}, kInt);
+  expect.dense("rates", rates, {"capacity", count, 2});
   DSMOE_CHECK_VALUE(0 <= steps && steps <= rates.size(0), function, ": steps is ", steps, "; rates has ", rates.size(0),
                     " of them");
   const DeviceGuard guard(first.device());
@@ -154,13 +124,10 @@ void lazy_adam_step(const Tensor& marks, const Tensor& rates, int64_t steps, con
   DSMOE_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function, ": ",
                     count, " new_rates and ", root_scales.size(),
                     " root_scales are given; it must be equally many, 1 to ", kLazyAdamMaxTensors);
-  check_real(function, "rates", rates);
-  check_shape(function, "rates", rates, {"capacity", count, 2});
-  check_contiguous(function, "rates", rates);
-  check_shape(function, "marks", marks, {"N"});
-  check_row_numbers(function, "marks", marks, marks);
-  check_row_numbers(function, "radii", radii, marks);
-  check_device(function, "rates", rates, "marks", marks);
+  const Expect expect(function, "rates", rates);
+  expect.dense("rates", rates, {"capacity", count, 2});
+  expect.dense("marks", marks, {"N"}, kInt);
+  expect.dense("radii", radii, {marks.size(0)}, kInt);
   DSMOE_CHECK_VALUE(0 <= steps && steps < rates.size(0), function, ": steps is ", steps, "; rates has room for ",
                     rates.size(0));
   const DeviceGuard guard(marks.device());
@@ -192,21 +159,20 @@ void gaussian_adam(const Tensors& raw, const Tensors& values, const Tensors& dL_
   DSMOE_CHECK_VALUE(
       raw.size() == kGaussianAdamTensors && rates.size() == raw.size() && root_scales.size() == raw.size(), function,
       ": raw, rates and root_scales must have ", kGaussianAdamTensors, " items each");
-  check_real(function, "raw[0]", raw[0]);
-  for (size_t i = 0; i < raw.size(); ++i) {
-    check_shape(function, item_name("raw", i).c_str(), raw[i], {raw[0].size(0), kSizes[i]});
-  }
-  check_like_parameters(function, "raw", raw, raw);
-  check_like_parameters(function, "values", values, Tensors(raw.begin() + 1, raw.end()));
-  check_like_parameters(function, "dL_dvalues", dL_dvalues, raw);
-  check_like_parameters(function, "moments", moments, raw);
-  check_like_parameters(function, "squares", squares, raw);
-  check_row_numbers(function, "radii", radii, raw[0]);
+  const Expect expect(function, "raw[0]", raw[0]);
+  expect.dense("raw[0]", raw[0], {"N", kSizes[0]});
+  const int64_t count = raw[0].size(0);
+  for (size_t i = 1; i < raw.size(); ++i) expect.dense(item_name("raw", i), raw[i], {count, kSizes[i]});
+  expect.dense_alike("values", values, Tensors(raw.begin() + 1, raw.end()));
+  expect.dense_alike("dL_dvalues", dL_dvalues, raw);
+  expect.dense_alike("moments", moments, raw);
+  expect.dense_alike("squares", squares, raw);
+  expect.dense("radii", radii, {count}, kInt);
   const DeviceGuard guard(raw[0].device());
   dispatch_real(raw[0], [&](auto zero) {
     using scalar_t = decltype(zero);
     GaussianAdam<scalar_t> adam = {};
-    adam.num_gaussians = raw[0].size(0);
+    adam.num_gaussians = count;
     adam.radii = radii.data_ptr<int32_t>();
     adam.constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
     for (size_t i = 0; i < raw.size(); ++i) {
@@ -242,18 +208,15 @@ inline void check_rows(const char* function, const Tensor& rows, const Tensor& o
 template <class Backend> Tensors gather_rows(const Tensors& tensors, const Tensor& rows) {
   const char* function = "gather_rows";
   if (tensors.empty()) return {};
-  check_real(function, "tensors[0]", tensors[0]);
-  check_shape(function, "rows", rows, {"M"});
-  check_type(function, "rows", rows, kLong);
-  check_device(function, "rows", rows, "tensors[0]", tensors[0]);
+  const Expect expect(function, "tensors[0]", tensors[0]);
+  expect("rows", rows, {"M"}, kLong);
   const DeviceGuard guard(rows.device());
   const Tensor list = rows.contiguous();
   check_rows(function, list, tensors[0]);
   Tensors dense, results;
   for (size_t i = 0; i < tensors.size(); ++i) {
-    const std::string name = item_name("tensors", i);
-    check_like(function, name.c_str(), tensors[i], "tensors[0]", tensors[0]);
-    DSMOE_CHECK_VALUE(tensors[i].dim() > 0, function, ": ", name, " has no rows");
+    expect(item_name("tensors", i), tensors[i], shape_of(tensors[i].sizes()));
+    DSMOE_CHECK_VALUE(tensors[i].dim() > 0, function, ": ", item_name("tensors", i), " has no rows");
     std::vector<int64_t> shape = tensors[i].sizes().vec();
     shape[0] = list.size(0);
     dense.push_back(tensors[i].contiguous());
@@ -276,11 +239,8 @@ template <class Backend>
 std::tuple<Tensor, Tensor> image_loss(const Tensor& image, const Tensor& target, double l1_weight, double ssim_weight,
                                       double offset, int64_t margin, bool with_gradient) {
   const char* function = "image_loss";
-  check_real(function, "image", image);
-  refuse_tangent(function, image);
-  refuse_tangent(function, target);
-  check_same_shape(function, "target", target, "image", image);
-  check_device(function, "target", target, "image", image);
+  const Expect expect(function, "image", image);
+  expect("image", image, shape_of(image.sizes()));
   DSMOE_CHECK_VALUE(image.dim() >= 2 && image.numel() > 0, function, ": image has shape ", image.sizes(),
                     "; it must be [..., H, W] with at least one pixel");
   const int64_t height = image.size(image.dim() - 2), width = image.size(image.dim() - 1);
@@ -288,10 +248,8 @@ std::tuple<Tensor, Tensor> image_loss(const Tensor& image, const Tensor& target,
                     "; its sides may have ", INT_MAX, " pixels");
   DSMOE_CHECK_VALUE(margin >= 0 && height > 2 * margin && width > 2 * margin, function, ": image has shape ",
                     image.sizes(), "; with a margin of ", margin, " its sides must be at least ", 2 * margin + 1);
-  const bool bytes = target.scalar_type() == kByte;
-  DSMOE_CHECK_TYPE(bytes || target.scalar_type() == image.scalar_type(), function, ": target is ",
-                   dtype_name(target.scalar_type()), "; it must be ", dtype_name(image.scalar_type()),
-                   ", as image is, or uint8");
+  const bool bytes = target.defined() && target.scalar_type() == kByte;
+  expect("target", target, shape_of(image.sizes()), bytes ? kByte : kAsLike);
   const DeviceGuard guard(image.device());
   const Tensor x = image.contiguous(), y = target.contiguous();
   const int64_t planes = x.numel() / (height * width);
@@ -323,13 +281,10 @@ using GaussianTensors = std::tuple<Tensor, Tensor, Tensor>;
 
 inline GaussianTensors checked(const char* function, const Tensor& opacities, const Tensor& scales,
                                const Tensor& rotations) {
-  check_real(function, "opacities", opacities);
-  for (const Tensor* tensor : {&opacities, &scales, &rotations}) refuse_tangent(function, *tensor);
-  check_like(function, "scales", scales, "opacities", opacities);
-  check_like(function, "rotations", rotations, "opacities", opacities);
-  check_shape(function, "opacities", opacities, {"N", 1});
-  check_shape(function, "scales", scales, {opacities.size(0), 3});
-  check_shape(function, "rotations", rotations, {opacities.size(0), 4});
+  const Expect expect(function, "opacities", opacities);
+  expect("opacities", opacities, {"N", 1});
+  expect("scales", scales, {opacities.size(0), 3});
+  expect("rotations", rotations, {opacities.size(0), 4});
   return {opacities.contiguous(), scales.contiguous(), rotations.contiguous()};
 }
 
@@ -365,14 +320,12 @@ GaussianTensors activate_backward(const Tensors& raw, const Tensors& values, con
   DSMOE_CHECK_VALUE(raw.size() == 3 && values.size() == 3, function, ": raw and values must have 3 tensors each");
   const GaussianTensors raw_tensors = checked(function, raw[0], raw[1], raw[2]);
   const GaussianTensors value_tensors = checked(function, values[0], values[1], values[2]);
-  check_same_shape(function, "values", values[0], "raw", raw[0]);
-  check_like(function, "values", values[0], "raw", raw[0]);
+  const Expect expect(function, "raw[0]", raw[0]);
+  expect("values[0]", values[0], shape_of(raw[0].sizes()));
   const DeviceGuard guard(raw[0].device());
   const auto dense = [&](const char* name, const OptionalTensor& gradient, const Tensor& value) {
     if (!gradient.has_value()) return Tensor();
-    refuse_tangent(function, *gradient);
-    check_same_shape(function, name, *gradient, "its value", value);
-    check_like(function, name, *gradient, "raw", raw[0]);
+    expect(name, *gradient, shape_of(value.sizes()));
     return gradient->contiguous();
   };
   const GaussianTensors gradients = {dense("dL_dopacities", dL_dopacities, values[0]),
@@ -393,18 +346,11 @@ GaussianTensors activate_backward(const Tensors& raw, const Tensors& values, con
 
 template <class Backend>
 void add_view(const Tensor& dL_dmeans2D, const Tensor& radii, const Tensor& gradient_sum, const Tensor& view_count) {
-  const char* function = "add_view";
-  check_real(function, "dL_dmeans2D", dL_dmeans2D);
-  check_shape(function, "radii", radii, {"N"});
-  check_type(function, "radii", radii, kInt);
-  check_shape(function, "dL_dmeans2D", dL_dmeans2D, {radii.size(0), 3});
-  check_device(function, "radii", radii, "dL_dmeans2D", dL_dmeans2D);
-  for (const Tensor* statistic : {&gradient_sum, &view_count}) {
-    const char* name = statistic == &gradient_sum ? "gradient_sum" : "view_count";
-    check_shape(function, name, *statistic, {radii.size(0)});
-    check_like(function, name, *statistic, "dL_dmeans2D", dL_dmeans2D);
-    check_contiguous(function, name, *statistic);
-  }
+  const Expect expect("add_view", "dL_dmeans2D", dL_dmeans2D);
+  expect("radii", radii, {"N"}, kInt);
+  expect("dL_dmeans2D", dL_dmeans2D, {radii.size(0), 3});
+  expect.dense("gradient_sum", gradient_sum, {radii.size(0)});
+  expect.dense("view_count", view_count, {radii.size(0)});
   const DeviceGuard guard(radii.device());
   const Tensor gradients = dL_dmeans2D.contiguous(), dense_radii = radii.contiguous();
   dispatch_real(gradients, [&](auto zero) {
@@ -421,8 +367,10 @@ void add_view(const Tensor& dL_dmeans2D, const Tensor& radii, const Tensor& grad
 
 // Of `mean_squared_neighbour_distances`, whose implementations share no more.
 inline void check_points(const Tensor& points) {
-  check_real("mean_squared_neighbour_distances", "points", points);
-  check_shape("mean_squared_neighbour_distances", "points", points, {"N", 3});
+  const Expect expect("distCUDA2", "points", points);
+  expect("points", points, {"N", 3});
+  const int64_t index = first_set(logical_not(all_of(isfinite(points), 1)));
+  DSMOE_CHECK_VALUE(index < 0, expect.function, ": points[", index, "] is not finite");
 }
 
 template <class Backend> void register_training_ops(Library& m) {

@@ -260,11 +260,12 @@ TEST(Torch, WhatDoesNotFitIsRefused) {
   refused([](Scene& s) { s.settings.blend_mode = "mean"; },
           "blend_mode is 'mean'; it must be one of alpha, smoe, smoe_eq7, smoe_tn, smoe_std");
   refused([](Scene& s) { s.settings.blend_mode = "smoe_tn"; }, "only 'smoe' and 'smoe_eq7' know it");
-  refused([](Scene& s) { s.settings.background_gate = -0.1; }, "background_gate is -0.1; it must be a number");
+  refused([](Scene& s) { s.settings.background_gate = -0.1; }, "background_gate is -0.1; it must be 0 to 1e+30");
   refused([](Scene& s) { s.arguments.outputs = {"color"}; }, "outputs holds 'color'; it may hold alpha");
-  refused([](Scene& s) { s.settings.bg.reset(); }, "rasterize: bg is undefined");
+  refused([](Scene& s) { s.means3D.reset(); }, "rasterize: means3D is absent; it must be given");
+  refused([](Scene& s) { s.settings.bg.reset(); }, "rasterize: bg is absent; it must be given");
   refused([](Scene& s) { s.arguments.scales.reset(); }, "rotations is given without scales");
-  refused([](Scene& s) { s.settings.image_width = 0; }, "image_height x image_width is 24 x 0");
+  refused([](Scene& s) { s.settings.image_width = 0; }, "image_width x image_height is 0 x 24");
   expect_error<c10::TypeError>([&] { dsmoe::rasterize(good.means3D.to(at::kHalf), good.opacities, good.settings); },
                                "means3D is float16");
 }
@@ -387,6 +388,8 @@ TEST(Training, NeighboursAndViewsAreCounted) {
   EXPECT_EQ(sum[0].item<float>(), 5);
   EXPECT_EQ(views[0].item<float>(), 1);
   EXPECT_EQ(sum[1].item<float>() + views[1].item<float>(), 0);
+  axis[2].fill_(INFINITY);
+  expect_error<c10::ValueError>([&] { dsmoe::distCUDA2(axis.view({2, 3})); }, "distCUDA2: points[0] is not finite");
 }
 
 // Sums in another order, in double: relative differences of roundings, times the number of terms.
