@@ -153,8 +153,8 @@ struct Cpu {
   }
 
   template <class S>
-  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
-                       const GateMap& map) {
+  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
+                       const Options& options, const GateMap& map) {
     cpu::gate_map(walked<S>(expect, radii, saved, config, options), map);
   }
 

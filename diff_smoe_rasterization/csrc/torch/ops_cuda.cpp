@@ -166,8 +166,8 @@ struct Cuda {
   }
 
   template <class S>
-  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config, const Options& options,
-                       const GateMap& map) {
+  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
+                       const Options& options, const GateMap& map) {
     TensorMemory memory(radii);
     cuda::gate_map(walked<S>(expect, radii, saved, config, options), map, {current_stream(), &memory});
   }
