@@ -78,7 +78,7 @@ class GaussianRasterizationSettings(NamedTuple):
     sh_degree: int  # active degree, 0 to 3; shs may hold more
     campos: torch.Tensor  # [3] camera centre, world
     prefiltered: bool = False  # the caller asserts that every point lies in front of the near plane
-    debug: bool = False  # check inputs and results for NaN; slower
+    debug: bool = False  # check images and gradients for NaN; slower. Attributes: `strict`
     antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
     near: float = 0.2  # Gaussians with view depth <= near are culled
     # SMoE modes: also skip alpha below this; 0 is the paper's rule. `smoe`: pairs below this are no strong ones
@@ -93,7 +93,8 @@ class GaussianRasterizationSettings(NamedTuple):
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
     # `smoe` and `smoe_eq7`: faint pairs and tails count in pixels whose near pairs have a gate sum below this. 2: in
-    # all, as in the authors' program and in the text; slower. 0: in none. None: 0.9 in `smoe`, 2 in `smoe_eq7`
+    # all, as in the authors' program and in the text; slower. 0: in none. None: 0.9 in `smoe`, 2 in `smoe_eq7`.
+    # The other modes ignore it
     faint_below: Optional[float] = None
 
 
@@ -225,13 +226,18 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
     """Returns the gate sum of near pairs below which a rendering in this blend mode counts faint pairs and tails.
 
-    Raises ValueError for what is no finite number of 0 or more.
+    Raises ValueError for what is no number of 0 or more, or a greater one than MAX_BACKGROUND_GATE.
     """
     if faint_below is None:
         return _FAINT_BELOW.get(blend_mode, 2.0)
-    if isinstance(faint_below, str) or not 0 <= faint_below < math.inf:
-        raise ValueError(f"faint_below is {faint_below!r}; it must be a finite number of 0 or more, or None")
-    return float(faint_below)
+    try:
+        value = math.nan if isinstance(faint_below, str) else float(faint_below)
+    except (TypeError, ValueError, RuntimeError):  # what has no length of one
+        value = math.nan
+    if not 0 <= value <= MAX_BACKGROUND_GATE:
+        raise ValueError(f"faint_below is {faint_below!r}; it must be a number, 0 or more and at most "
+                         f"{MAX_BACKGROUND_GATE:g}, or None")
+    return value
 
 
 def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:

@@ -27,7 +27,8 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
-                                usage="%(prog)s SCENE -o OUT [OPTION ...]\n       %(prog)s --resume OUT [OPTION ...]",
+                                usage="%(prog)s SCENE -o OUT [OPTION ...]\n"
+                                      "       %(prog)s --resume -o OUT [OPTION ...]",
                                 description="Trains Gaussians on a scene: photographs whose cameras are known.",
                                 formatter_class=argparse.RawDescriptionHelpFormatter, epilog=TRAIN_EXAMPLES)
     train.add_argument("scene", metavar="SCENE", nargs="?", default=argparse.SUPPRESS,

@@ -21,7 +21,7 @@ def check_spz() -> None:
     try:
         import gsply  # noqa: F401
     except ImportError as error:
-        raise TrainerError("for .spz gsply is needed (pip install gsply); it needs Python 3.10") from error
+        raise TrainerError("for .spz gsply is needed (pip install gsply); it needs Python 3.10 or later") from error
 
 
 def spz_bytes(gaussians: Gaussians) -> bytes:

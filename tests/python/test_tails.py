@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 import torch
@@ -199,8 +200,8 @@ def test_gradients_hold_the_tails_constant():
     assert (plain["opacities"] - actual["opacities"]).abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), "0.9"])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), 1e300, "0.9", [0.9]])
 def test_refuses_what_is_no_faint_below(value):
     scene = random_scene("smoe", 3).with_settings(faint_below=value)
-    with pytest.raises(ValueError, match=f"faint_below is {value!r}; it must be a finite number of 0 or more, or None"):
+    with pytest.raises(ValueError, match=re.escape(f"faint_below is {value!r}; it must be a number, 0 or more")):
         rasterize(settings=scene.settings, **scene.inputs)
