@@ -84,12 +84,11 @@ Expect check_footprints(const char* function, const Footprints& of, const Option
   return expect;
 }
 
-Expect check_score(const char* function, const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
-                   const Tensor& background_gate, const Options& options) {
+Expect check_saved(const char* function, const Tensor& radii, const Saved& saved, const Tensor& background_gate,
+                   const Options& options) {
   check_image_size(function, options);
   DSMOE_CHECK_VALUE(!saved.empty(), function, ": saved has length 0; it must be what rasterize returned");
   const Expect expect(function, "means3D", saved[0]);
-  expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
   expect.dense("radii", radii, {"N"}, kInt);
   check_background_gate(expect, background_gate);
   return expect;

@@ -345,7 +345,8 @@ template <class Backend> void contributions(Arguments& arguments) {
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  const Expect expect = check_score("contributions", pixel_weights, radii, saved, background_gate, options);
+  const Expect expect = check_saved("contributions", radii, saved, background_gate, options);
+  expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
   const typename Backend::Guard guard(radii.device());
   const auto real = [&] { return empty({radii.numel()}, pixel_weights); };
   const Tensor weights = real(), pixels = empty_like(radii), blend_weights = real(), distances = real();
@@ -371,8 +372,9 @@ template <class Backend> void importance(Arguments& arguments) {
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  const Expect expect = check_score("importance", pixel_weights, radii, saved, background_gate, options);
+  const Expect expect = check_saved("importance", radii, saved, background_gate, options);
   const int64_t height = options.image_height, width = options.image_width;
+  expect("pixel_weights", pixel_weights, {height, width});
   expect("share_weights", share_weights, {height, width});
   expect("color", color, {"C", height, width});
   expect("gate_sum", gate_sum, {1, height, width});
