@@ -84,7 +84,7 @@ Expect check_footprints(const char* function, const Footprints& of, const Option
   return expect;
 }
 
-Expect check_score(const char* function, const Tensor& radii, const Saved& saved, const Tensor& background_gate,
+Expect check_saved(const char* function, const Tensor& radii, const Saved& saved, const Tensor& background_gate,
                    const Options& options) {
   check_image_size(function, options);
   DSMOE_CHECK_VALUE(!saved.empty(), function, ": saved has length 0; it must be what rasterize returned");

@@ -43,7 +43,7 @@ struct Footprints {
 Expect check_footprints(const char* function, const Footprints& of, const Options& options);
 
 // What every op takes that goes over what a rendering saved.
-Expect check_score(const char* function, const Tensor& radii, const Saved& saved, const Tensor& background_gate,
+Expect check_saved(const char* function, const Tensor& radii, const Saved& saved, const Tensor& background_gate,
                    const Options& options);
 
 // Checks the tensors that a rendering saved, and points to them. sizes: what is -1 in them is not checked.

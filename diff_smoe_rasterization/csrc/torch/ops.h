@@ -345,7 +345,7 @@ template <class Backend> void contributions(Arguments& arguments) {
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  const Expect expect = check_score("contributions", radii, saved, background_gate, options);
+  const Expect expect = check_saved("contributions", radii, saved, background_gate, options);
   expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
   const typename Backend::Guard guard(radii.device());
   const auto real = [&] { return empty({radii.numel()}, pixel_weights); };
@@ -372,7 +372,7 @@ template <class Backend> void importance(Arguments& arguments) {
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  const Expect expect = check_score("importance", radii, saved, background_gate, options);
+  const Expect expect = check_saved("importance", radii, saved, background_gate, options);
   expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
   const int64_t height = options.image_height, width = options.image_width;
   expect("share_weights", share_weights, {height, width});
@@ -407,7 +407,7 @@ template <class Backend> void gate_map(Arguments& arguments) {
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
-  const Expect expect = check_score("gate_map", radii, saved, background_gate, options);
+  const Expect expect = check_saved("gate_map", radii, saved, background_gate, options);
   const typename Backend::Guard guard(radii.device());
   const auto image = [&] { return empty({options.image_height, options.image_width}, radii, kInt); };
   const Tensor gaussians = image(), counts = image();
