@@ -84,7 +84,8 @@ def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     worker = [sys.executable, "-m", "dsmoe", "train", tiny_config.scene, "-o", tiny_config.output,
-              "--iterations", "1000000", "--batch", "1", "--quiet", "--checkpoint-every", "0"]
+              "--iterations", "1000000", "--batch", "1", "--quiet", "--checkpoint-every", "100"]
+    checkpoint = os.path.join(tiny_config.output, "checkpoint.pt")
     launcher = f"import subprocess, sys; sys.exit(subprocess.call({worker!r}))"
     environment = {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")]), "RANK": "0",
                    "WORLD_SIZE": "1", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port,
@@ -93,12 +94,13 @@ def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
                           cwd=os.path.dirname(tiny_config.output),  # -m would find the sources in that of the tests
                           stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.readline()
-        while process.poll() is None and not os.path.isfile(os.path.join(tiny_config.output, "config.json")):
+        while process.poll() is None and not os.path.isfile(checkpoint):  # it trains, and handles signals
             time.sleep(0.1)
+        os.remove(checkpoint)
         process.kill()
         errors = process.stderr.read()  # to its end, at which the worker has ended
     assert "interrupted; continue it with --resume" in errors, errors
-    assert os.path.isfile(os.path.join(tiny_config.output, "checkpoint.pt"))
+    assert os.path.isfile(checkpoint)
 
 
 @pytest.mark.slow
