@@ -188,6 +188,13 @@ def configure(folder, options):
     return [entry["file"] for entry in json.loads((folder / "compile_commands.json").read_text())]
 
 
+def replace(source, target):
+    """Copies a library. Processes that have loaded the old one keep it: its file is not written into."""
+    fresh = target.with_name(target.name + ".new")
+    shutil.copy2(source, fresh)
+    os.replace(fresh, target)
+
+
 def extension():
     """Returns the arguments of setup() that build libdsmoe.so and `diff_smoe_rasterization._C`."""
     torch, cpp_extension = import_build_tools()
@@ -213,8 +220,8 @@ def extension():
             run_cmake("--build", folder, "--parallel", jobs(), "--target", "dsmoe_package")
             path = Path(self.get_ext_fullpath(module.name))
             path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(folder / "package" / "_C.so", path)
-            shutil.copy2(folder / "package" / "libdsmoe.so", path.parent)
+            replace(folder / "package" / "_C.so", path)
+            replace(folder / "package" / "libdsmoe.so", path.with_name("libdsmoe.so"))
             lines = ['"""What the extension was built against; readable even where it cannot be loaded."""']
             lines += [f"{name} = {value!r}" for name, value in built_against.items()]
             path.with_name("_build_info.py").write_text("\n".join(lines) + "\n")

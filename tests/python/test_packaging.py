@@ -57,6 +57,15 @@ def load_setup():
     return module
 
 
+def test_a_build_does_not_write_into_a_loaded_library(tmp_path):
+    source, target = tmp_path / "built.so", tmp_path / "libdsmoe.so"
+    source.write_text("new")
+    target.write_text("old")
+    with open(target) as loaded:
+        load_setup().replace(source, target)
+        assert (loaded.read(), target.read_text()) == ("old", "new")
+
+
 @pytest.mark.skipif(not (shutil.which("cmake") and shutil.which("c++")), reason="needs cmake and c++")
 def test_every_file_is_compiled_once(tmp_path, monkeypatch):
     """Configured only. What is for CUDA needs a toolkit, and is left out here."""

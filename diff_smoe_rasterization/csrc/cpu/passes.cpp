@@ -18,8 +18,11 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map) {
   refuse_gate_map("cpu::gate_map", frame, map);
-  for_each_band(frame, nullptr,
-                [&](const Frame<S>& band) { walk_tiles(band, GateMapPass<S>{map}, tile_kernels<S>().gate_map, 1); });
+  // What a pixel keeps, less the two arrays of tile_scratch_size that a pass leaves free.
+  constexpr int kFurther = GateMapPass<S>::template State<S>::kNum - 2;
+  for_each_band(frame, nullptr, [&](const Frame<S>& band) {
+    walk_tiles(band, GateMapPass<S>{map}, tile_kernels<S>().gate_map, kFurther);
+  });
 }
 
 #define DSMOE_INSTANTIATE(S)                                               \

@@ -47,9 +47,9 @@ void adam(const Tensors& parameters, const Tensors& gradients, const Tensors& mo
     DSMOE_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)), function,
                       ": ", item_name("parameters", i), " has shape ", parameters[i].sizes(), "; visible has ",
                       flags.defined() ? flags.size(0) : 0, " rows, and so must every parameter");
+    expect(item_name("gradients", i), gradients[i], shape_of(parameters[i].sizes()));
     dense_gradients.push_back(gradients[i].contiguous());
   }
-  expect.dense_alike("gradients", dense_gradients, parameters);
 
   dispatch_real(first, [&](auto zero) {
     using scalar_t = decltype(zero);
@@ -217,6 +217,8 @@ template <class Backend> Tensors gather_rows(const Tensors& tensors, const Tenso
   for (size_t i = 0; i < tensors.size(); ++i) {
     expect(item_name("tensors", i), tensors[i], shape_of(tensors[i].sizes()));
     DSMOE_CHECK_VALUE(tensors[i].dim() > 0, function, ": ", item_name("tensors", i), " has no rows");
+    DSMOE_CHECK_VALUE(tensors[i].size(0) == tensors[0].size(0), function, ": ", item_name("tensors", i), " has ",
+                      tensors[i].size(0), " rows; it must have ", tensors[0].size(0), ", as tensors[0] has");
     std::vector<int64_t> shape = tensors[i].sizes().vec();
     shape[0] = list.size(0);
     dense.push_back(tensors[i].contiguous());
@@ -246,8 +248,9 @@ std::tuple<Tensor, Tensor> image_loss(const Tensor& image, const Tensor& target,
   const int64_t height = image.size(image.dim() - 2), width = image.size(image.dim() - 1);
   DSMOE_CHECK_VALUE(height <= INT_MAX && width <= INT_MAX, function, ": image has shape ", image.sizes(),
                     "; its sides may have ", INT_MAX, " pixels");
-  DSMOE_CHECK_VALUE(margin >= 0 && height > 2 * margin && width > 2 * margin, function, ": image has shape ",
-                    image.sizes(), "; with a margin of ", margin, " its sides must be at least ", 2 * margin + 1);
+  DSMOE_CHECK_VALUE(0 <= margin && margin <= INT_MAX, function, ": margin is ", margin, "; it must be 0 to ", INT_MAX);
+  DSMOE_CHECK_VALUE(height > 2 * margin && width > 2 * margin, function, ": image has shape ", image.sizes(),
+                    "; with a margin of ", margin, " its sides must be at least ", 2 * margin + 1);
   const bool bytes = target.defined() && target.scalar_type() == kByte;
   expect("target", target, shape_of(image.sizes()), bytes ? kByte : kAsLike);
   const DeviceGuard guard(image.device());

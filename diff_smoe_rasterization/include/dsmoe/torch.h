@@ -44,7 +44,7 @@ struct GaussianRasterizationSettings {
   int64_t sh_degree = 0;             // active degree, 0 to 3; shs may hold more
   at::Tensor campos;                 // [3] camera centre, world
   bool prefiltered = false;          // the caller asserts that every point lies in front of the near plane
-  bool debug = false;                // check inputs and results for NaN; slower
+  bool debug = false;                // check images and gradients for NaN; slower
   bool antialiasing = false;         // scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
   double near = 0.2;                 // Gaussians with view depth <= near are culled
   double alpha_min = 0;              // SMoE modes: also skip alpha below this; `smoe`: such pairs are no strong ones

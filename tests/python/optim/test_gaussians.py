@@ -166,6 +166,8 @@ def test_rows_that_do_not_fit_are_refused(device):
         gather_rows([torch.zeros(4)], torch.zeros(2, dtype=torch.int32))
     with pytest.raises(TypeError, match=r"tensors\[1\] is float64"):
         gather_rows([torch.zeros(4), torch.zeros(4, dtype=torch.float64)], torch.tensor([0]))
+    with pytest.raises(ValueError, match=r"tensors\[1\] has 3 rows; it must have 4, as tensors\[0\] has"):
+        gather_rows([torch.zeros(4), torch.zeros(3)], torch.tensor([3]))
 
 
 @pytest.mark.parametrize("rows, ends", [([3, -1, 0], "from -1 to 3"), ([0, 4], "from 0 to 4"), ([2 ** 40], "")])
