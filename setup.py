@@ -143,7 +143,7 @@ def options_of_cmake(torch, cpp_extension, with_cuda, stable):
     core = os.environ.get("DSMOE_CORE_FOLDER") if torch.compiled_with_cxx11_abi() else None  # it has the newer ABI
     includes = cpp_extension.include_paths() + [sysconfig.get_path(name) for name in ("include", "platinclude")]
     options = {
-        "DSMOE_PYTHON": "ON",
+        "DSMOE_PYTHON_PACKAGE": "ON",
         "DSMOE_BUILD_TESTS": "OFF",
         "DSMOE_BUILD_TOOLS": "OFF",
         "DSMOE_CUDA": "ON" if with_cuda else "OFF",

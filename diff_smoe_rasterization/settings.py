@@ -213,14 +213,7 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
         if tensor.numel() != 1:
             raise ValueError(f"background_gate has shape {list(tensor.shape)}; it must have one element")
         return background_gate
-    try:
-        value = float(background_gate)
-    except (TypeError, ValueError):
-        value = math.nan
-    if not 0 <= value <= MAX_BACKGROUND_GATE:
-        raise ValueError(f"{source} is {background_gate!r}; it must be a number, 0 or more and at most "
-                         f"{MAX_BACKGROUND_GATE:g}")
-    return value
+    return _weight(source, background_gate)
 
 
 def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
@@ -230,14 +223,7 @@ def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
     """
     if faint_below is None:
         return _FAINT_BELOW.get(blend_mode, 2.0)
-    try:
-        value = math.nan if isinstance(faint_below, str) else float(faint_below)
-    except (TypeError, ValueError, RuntimeError):  # what has no length of one
-        value = math.nan
-    if not 0 <= value <= MAX_BACKGROUND_GATE:
-        raise ValueError(f"faint_below is {faint_below!r}; it must be a number, 0 or more and at most "
-                         f"{MAX_BACKGROUND_GATE:g}, or None")
-    return value
+    return _weight("faint_below", faint_below, text_counts=False, other=", or None")
 
 
 def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:
@@ -247,6 +233,21 @@ def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:
 
 def _gated_names() -> str:
     return " and ".join(repr(mode) for mode in GATED_MODES)
+
+
+def _weight(name: str, given: Any, text_counts: bool = True, other: str = "") -> float:
+    """The number that is given. Raises ValueError for what is none, and for one below 0 or above MAX_BACKGROUND_GATE.
+
+    text_counts: also what a text such as "0.1" says. other: what may be given too, for the error.
+    """
+    try:
+        value = math.nan if isinstance(given, str) and not text_counts else float(given)
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several elements
+        value = math.nan
+    if not 0 <= value <= MAX_BACKGROUND_GATE:
+        raise ValueError(f"{name} is {given!r}; it must be a number, 0 or more and at most "
+                         f"{MAX_BACKGROUND_GATE:g}{other}")
+    return value
 
 
 def _is_tensor(value: Any) -> bool:

@@ -74,14 +74,17 @@ def test_places_and_sums_are_the_references(mode, name):
     assert not splats.contributions(pixel_weights).pixels[culled].any()
 
 
+def scene_of_weights(mode, scale, dtype, count=40):
+    """Its image has a channel for each Gaussian: the map of that Gaussian's weights."""
+    scene = random_scene(mode, count, 61, 43, scale=scale, opacity=(0.1, 3.0), channels=count, dtype=dtype,
+                         bg=torch.zeros(count))
+    return scene.with_inputs(colors_precomp=torch.eye(count, dtype=dtype))
+
+
 @with_gate
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
-    """With a channel for each Gaussian, an image is the map of one Gaussian's weights."""
-    count = 40
-    scene = random_scene(mode, count, 61, 43, scale=0.25, opacity=(0.1, 3.0), channels=count, dtype=dtype,
-                         bg=torch.zeros(count))
-    scene = scene.with_inputs(colors_precomp=torch.eye(count, dtype=dtype))
+    scene = scene_of_weights(mode, 0.25, dtype)
     pixel_weights = weights_for(scene.settings, dtype=dtype)
     rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
     blended = rendering.color > 0
@@ -105,11 +108,8 @@ def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
 @with_gate
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_gate_map_is_what_the_image_was_blended_of(mode, dtype):
-    """As above; what divides the weights of a pixel does not change which is the largest."""
-    count = 40
-    scene = random_scene(mode, count, 61, 43, scale=0.1, opacity=(0.1, 3.0), channels=count, dtype=dtype,
-                         bg=torch.zeros(count))
-    scene = scene.with_inputs(colors_precomp=torch.eye(count, dtype=dtype))
+    """What divides the weights of a pixel does not change which is the largest."""
+    scene = scene_of_weights(mode, 0.1, dtype)
     rendering, splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)
     actual = splats.gate_map()
     assert isinstance(actual, GateMap)

@@ -1,6 +1,7 @@
 // Runs passes over the pixels of a rendering (dsmoe/passes/pass.h).
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <memory>
 #include <vector>
@@ -12,6 +13,9 @@
 
 namespace dsmoe {
 namespace cpu {
+
+// The num_features of a pass: tile_pass_impl.h keeps four arrays and the numbers of a State, and six arrays are there.
+template <class Pass> constexpr int kScratchFeatures = std::max(Pass::template State<float>::kNum - 2, 0);
 
 // Runs a pass without sums, and the tiles of one with sums. num_features: how many the scratch memory has room for.
 template <class S, class Pass>

@@ -7,7 +7,7 @@ namespace cpu {
 
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map) {
   refuse_contributions("cpu::contributions", frame, map);
-  sum_pixels(frame, ContributionPass<S>{map}, tile_kernels<S>().contributions, 0);
+  sum_pixels(frame, ContributionPass<S>{map}, tile_kernels<S>().contributions, kScratchFeatures<ContributionPass<S>>);
 }
 
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map) {
@@ -18,10 +18,8 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map) {
   refuse_gate_map("cpu::gate_map", frame, map);
-  // What a pixel keeps, less the two arrays of tile_scratch_size that a pass leaves free.
-  constexpr int kFurther = GateMapPass<S>::template State<S>::kNum - 2;
   for_each_band(frame, nullptr, [&](const Frame<S>& band) {
-    walk_tiles(band, GateMapPass<S>{map}, tile_kernels<S>().gate_map, kFurther);
+    walk_tiles(band, GateMapPass<S>{map}, tile_kernels<S>().gate_map, kScratchFeatures<GateMapPass<S>>);
   });
 }
 
