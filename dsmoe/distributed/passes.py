@@ -55,7 +55,7 @@ class BatchPasses(Passes):
         means2D = batch.backward(batch.give_back(self._records))
         step.seen += [(gradients, projected.radii) for gradients, projected in zip(means2D, batch.projected)]
         if self.gate:
-            self.gate.take_gradient(sum(self._dL_dgates.unbind(), torch.zeros_like(step.loss)))
+            self.gate.gradient.copy_(sum(self._dL_dgates.unbind(), torch.zeros_like(step.loss)))
 
     def update(self) -> None:
         self.optimizer.step()

@@ -51,7 +51,6 @@ IN_ONE_FILE = (TRAINING, rendering("train.py"))
 TRAINERS = (
     # HAC (Chen et al. 2024) and HAC++ (2025) on Scaffold-GS (Lu et al. 2024); Octree-GS (Ren et al. 2024) too.
     Trainer("hac-plus", "scaffold", IN_ONE_FILE, ("imports gpcc_utils",)),
-    Trainer("hac-plus", "scaffold", IN_ONE_FILE, ("imports encodings", "imports lpips")),
     Trainer("hac", "scaffold", IN_ONE_FILE, ("imports encodings",)),
     Trainer("octree-gs", "scaffold", (*IN_ONE_FILE, rendering("render.py")), ("calls set_anchor_mask",)),
     Trainer("scaffold-gs", "scaffold", (*IN_ONE_FILE, rendering("render.py"))),

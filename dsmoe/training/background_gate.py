@@ -6,53 +6,58 @@ from typing import Any, Dict
 
 import torch
 
-from diff_smoe_rasterization.optimizers import FusedAdam
+from diff_smoe_rasterization.optimizers import corrected_rates
 from diff_smoe_rasterization.settings import MAX_BACKGROUND_GATE
 
 from ..config import TrainConfig
 from ..optimizer import batch_betas
 
 LIMIT = math.log(MAX_BACKGROUND_GATE)  # of |p|: beyond it float32 would soon be 0 or infinite
+EPSILON = 1e-8  # of Adam
+_OPS = torch.ops.diff_smoe_rasterization
 
 
 class LearnedGate:
-    """lambda = bound + exp(p): p is stepped by Adam; with the bound 0 too, lambda stays positive and finite."""
+    """lambda = bound + exp(p): p is stepped by Adam; with the bound 0 too, lambda stays positive and finite.
+
+    A step of training has no autograd here, and few kernels: where Gaussians are few, the host's time counts.
+    """
 
     def __init__(self, config: TrainConfig, device: str) -> None:
         """config: has bound, start and rate; by its views a step rate and betas go as those of the Gaussians."""
         self.bound = config.background_gate_bound
-        self.logarithm = torch.full((1,), math.log(config.background_gate_start - self.bound), device=device,
-                                    requires_grad=True)
-        self.adam = FusedAdam([self.logarithm], lr=config.background_gate_lr * math.sqrt(config.batch),
-                              betas=batch_betas(config.batch))
-        self.value = self().detach()  # [1], without gradient; always this tensor, so that renderers may hold it
-
-    def __call__(self) -> torch.Tensor:
-        """[1] lambda, whose gradient reaches p."""
-        return self.bound + self.logarithm.exp()
-
-    @torch.no_grad()
-    def take_gradient(self, dL_dgate: torch.Tensor) -> None:
-        """Sets p's gradient from the one by lambda, one number."""
-        self.logarithm.grad = dL_dgate.reshape(1) * self.logarithm.exp()
+        self.logarithm = torch.full((1,), math.log(config.background_gate_start - self.bound), device=device)
+        self._group = {"lr": config.background_gate_lr * math.sqrt(config.batch), "betas": batch_betas(config.batch)}
+        self._adam: Dict[str, Any] = {}
+        self._excess = self.logarithm.exp()  # of lambda over its bound
+        # [1], always this tensor, so that renderers may hold it.
+        self.value = self._excess + self.bound if self.bound else self._excess
+        self.gradient = torch.zeros_like(self.value)  # [1] by lambda; whoever differentiates a step writes it
 
     @torch.no_grad()
     def step(self) -> None:
-        """One step of Adam; the host does not wait for the device."""
-        self.adam.step()
+        """One step of Adam by `gradient`; the host does not wait for the device."""
+        adam = self._adam
+        if not adam:
+            adam.update(step=0, exp_avg=torch.zeros_like(self.value), exp_avg_sq=torch.zeros_like(self.value))
+        adam["step"] = int(adam["step"]) + 1
+        rate, root_scale = corrected_rates(self._group, adam["step"])
+        _OPS.adam([self.logarithm], [self.gradient * self._excess], [adam["exp_avg"]], [adam["exp_avg_sq"]], [rate],
+                  [root_scale], *self._group["betas"], EPSILON, None)
         self.logarithm.clamp_(-LIMIT, LIMIT)
-        self.logarithm.grad = None
-        self.value.copy_(self())
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        torch.exp(self.logarithm, out=self._excess)
+        if self.bound:
+            torch.add(self._excess, self.bound, out=self.value)
 
     def state_dict(self) -> Dict[str, Any]:
         """Tensors and plain values of a checkpoint."""
-        return {"logarithm": self.logarithm.detach(), "adam": dict(self.adam.state.get(self.logarithm, {}))}
+        return {"logarithm": self.logarithm, "adam": dict(self._adam)}
 
-    @torch.no_grad()
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         """Takes what `state_dict` gave."""
         self.logarithm.copy_(state["logarithm"])
-        self.value.copy_(self())
-        self.adam.state.clear()
-        if state["adam"]:
-            self.adam.state[self.logarithm] = dict(state["adam"])
+        self._evaluate()
+        self._adam = dict(state["adam"])

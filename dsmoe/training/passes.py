@@ -15,7 +15,7 @@ from diff_smoe_rasterization.direct import DirectRendering
 from diff_smoe_rasterization.extension import _C  # noqa: F401  (loading it registers the ops)
 from diff_smoe_rasterization.gaussians import activate
 from diff_smoe_rasterization.optimizers import corrected_rates
-from diff_smoe_rasterization.settings import GATED_MODES, Rendering
+from diff_smoe_rasterization.settings import Rendering
 from diff_smoe_rasterization.splats import Splats
 
 from ..model import PARAMETERS, GaussianModel
@@ -68,7 +68,7 @@ class _OneView(Passes):
 
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> ViewStep:
         (shown,) = views
-        rendering, self._means2D = self._draw(shown.view.camera, shown.background, self.gate() if self.gate else None)
+        rendering, self._means2D = self._draw(shown.view.camera, shown.background)
         target, loss, self._dL_dcolor = compare(shown, rendering.color.detach())
         return ViewStep(iteration, 1, loss, shown.view, target, rendering, self._splats, self._add_gradient)
 
@@ -80,11 +80,10 @@ class _OneView(Passes):
         step.seen.append((gradient, step.rendering.radii))
         del self._means2D, self._dL_dcolor  # they hold on to memory
 
-    def _draw(self, camera: Camera, background: Optional[torch.Tensor],
-              background_gate: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
+    def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
         """The image, and a tensor [N, 3] whose .grad `_differentiate` sets where radii > 0.
 
-        background, background_gate: in place of the renderer's; the latter gets its gradient.
+        background: in place of the renderer's.
         """
         raise NotImplementedError
 
@@ -93,7 +92,7 @@ class _OneView(Passes):
         raise NotImplementedError
 
     def _differentiate(self, dL_dcolor: torch.Tensor) -> None:
-        """From the gradient by the image [3, H, W] to those by all parameters."""
+        """From the gradient by the image [3, H, W] to those by all parameters and the gate."""
         raise NotImplementedError
 
     def _add_gradient(self, name: str, number: float) -> None:
@@ -106,10 +105,10 @@ class AutogradPasses(_OneView):
 
     _seen: Optional[Callable[[], Splats]] = None
 
-    def _draw(self, camera: Camera, background: Optional[torch.Tensor],
-              background_gate: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
+    def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
         means2D = torch.zeros_like(self.model.raw["means3D"], requires_grad=True)
-        view = (camera, background, background_gate)
+        self._gate_value = self.gate.value.clone().requires_grad_() if self.gate else None
+        view = (camera, background, self._gate_value)
         if self.renderer.rasterize is package_rasterizer():
             rendering, splats = self.renderer.with_splats(*view, means2D=means2D)
             self._seen = lambda: splats
@@ -126,6 +125,9 @@ class AutogradPasses(_OneView):
     def _differentiate(self, dL_dcolor: torch.Tensor) -> None:
         self._seen = None  # which holds on to memory
         self._color.backward(dL_dcolor)
+        if self.gate:
+            assert self._gate_value is not None and self._gate_value.grad is not None
+            self.gate.gradient = self._gate_value.grad
 
     @torch.enable_grad()
     def _add_gradient(self, name: str, number: float) -> None:
@@ -146,16 +148,13 @@ class DirectPasses(_OneView):
         self._made_of: List[Tuple[torch.Tensor, int]] = []  # these, and their versions at that time
         self._buffers: Dict[str, torch.Tensor] = {}  # gradients
 
-    def _draw(self, camera: Camera, background: Optional[torch.Tensor],
-              background_gate: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
+    def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
         model = self.model
         lazy = self.optimizer.lazy_colors()
         parameters = model.stored
         # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
         self._rendered = {name: weakref.ref(tensor) for name, tensor in parameters.items()}
-        self._gate_value = background_gate if self.renderer.blend_mode in GATED_MODES else None
-        gate = None if self._gate_value is None else self._gate_value.detach()
-        settings = self.renderer.settings_of(camera, background, gate)
+        settings = self.renderer.settings_of(camera, background)
         means2D = self._buffer("means2D", parameters["means3D"]).requires_grad_()
         means2D.grad = None
         self._activate()
@@ -179,14 +178,11 @@ class DirectPasses(_OneView):
         self._gradients = {name: self._buffer("d" + name, parameters[name]) for name in GEOMETRY}
         gradients = {**self._gradients, **dict(zip(self.model.color_sources(), lazy.gradients)),
                      "means2D": self._buffer("dmeans2D", parameters["means3D"])}
-        if self._gate_value is not None:
-            gradients["background_gate"] = torch.empty_like(self._gate_value)
+        if self.gate:
+            gradients["background_gate"] = self.gate.gradient
         self._direct.backward({"color": dL_dcolor}, gradients)
         self._direct = None  # which holds on to memory
         self._means2D.grad = gradients["means2D"]
-        if self._gate_value is not None:
-            with torch.enable_grad():
-                self._gate_value.backward(gradients["background_gate"])
 
     def _add_gradient(self, name: str, number: float) -> None:
         if self._stepped is self._radii:  # rows that were not seen hold anything

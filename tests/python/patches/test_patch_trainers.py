@@ -39,7 +39,8 @@ def test_in_public_checkouts_only_the_statements_change(name):
 def test_recognised_by_structure_alone():
     base = {"imports GaussianRasterizationSettings", "sets bg", "sets debug"}
     for name, signs in (("taming", {"sets pixel_weights", "imports SparseGaussianAdam"}),
-                        ("hac-plus", {"calls visible_filter", "imports gpcc_utils"})):
+                        ("hac-plus", {"calls visible_filter", "imports encodings", "imports gpcc_utils"}),
+                        ("hac", {"calls visible_filter", "imports encodings", "imports lpips"})):  # of lpipsPyTorch
         assert facts.recognise(base | signs)[0].name == name
     assert facts.recognise({"sets bg"})[0] is None
 

@@ -29,7 +29,7 @@ def gradients_of(trainer):
         seen.update({name: tensor.grad.clone() for name, tensor in trainer.model.raw.items()
                      if tensor.grad is not None})
         if trainer.gate:
-            seen["gate"] = trainer.gate.logarithm.grad.clone()
+            seen["gate"] = trainer.gate.gradient.clone()
 
     trainer.step(keep)
     return seen
