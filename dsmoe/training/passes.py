@@ -125,8 +125,8 @@ class AutogradPasses(_OneView):
     def _differentiate(self, dL_dcolor: torch.Tensor) -> None:
         self._seen = None  # which holds on to memory
         self._color.backward(dL_dcolor)
-        if self.gate:
-            assert self._gate_value is not None and self._gate_value.grad is not None
+        # A rasterizer that was given to the trainer may leave the gate without a gradient: it stays as it is.
+        if self.gate and self._gate_value is not None and self._gate_value.grad is not None:
             self.gate.gradient = self._gate_value.grad
 
     @torch.enable_grad()

@@ -62,6 +62,15 @@ def test_a_learned_gate_is_stepped_by_adam_from_its_start(tiny_config, scene, op
     assert trainer.renderer.background_gate is trainer.gate.value and not trainer.gate.value.requires_grad
 
 
+def test_a_gate_that_a_rasterizer_leaves_out_stays(tiny_config, scene):
+    def rasterize(means3D, opacities, settings, **arguments):
+        return package_rasterizer()(means3D, opacities, settings._replace(background_gate=0.0), **arguments)
+
+    trainer = Trainer(tiny_config.changed(background_gate="learned"), scene, rasterize)
+    trainer.step()
+    assert trainer.background_gate == pytest.approx(0.1, rel=1e-6)  # its start, in float32
+
+
 @pytest.mark.parametrize("push", [1, -1])
 def test_a_learned_gate_without_a_bound_stays_positive_and_finite(tiny_config, push):
     """Whatever the gradient: a hundred steps of a rate of 10 would leave float32 behind."""
