@@ -20,7 +20,8 @@ _OPS = torch.ops.diff_smoe_rasterization
 class LearnedGate:
     """lambda = bound + exp(p): p is stepped by Adam; with the bound 0 too, lambda stays positive and finite.
 
-    A step of training has no autograd here, and few kernels: where Gaussians are few, the host's time counts.
+    A step has no autograd here, few kernels, and Adam's op without the optimizer around it, which would nearly double
+    the host's time for the gate: where Gaussians are few, the host's time is the training's.
     """
 
     def __init__(self, config: TrainConfig, device: str) -> None:
@@ -32,7 +33,7 @@ class LearnedGate:
         self._excess = self.logarithm.exp()  # of lambda over its bound
         # [1], always this tensor, so that renderers may hold it.
         self.value = self._excess + self.bound if self.bound else self._excess
-        self.gradient = torch.zeros_like(self.value)  # [1] by lambda; whoever differentiates a step writes it
+        self.gradient = torch.zeros_like(self.value)  # [1] by lambda; passes write into this tensor
 
     @torch.no_grad()
     def step(self) -> None:

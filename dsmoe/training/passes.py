@@ -107,8 +107,11 @@ class AutogradPasses(_OneView):
 
     def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
         means2D = torch.zeros_like(self.model.raw["means3D"], requires_grad=True)
-        self._gate_value = self.gate.value.clone().requires_grad_() if self.gate else None
-        view = (camera, background, self._gate_value)
+        gate = None
+        if self.gate:
+            gate = self.gate.value.clone().requires_grad_()
+            gate.grad = self.gate.gradient.zero_()  # to which autograd adds; 0 where a given rasterizer leaves it out
+        view = (camera, background, gate)
         if self.renderer.rasterize is package_rasterizer():
             rendering, splats = self.renderer.with_splats(*view, means2D=means2D)
             self._seen = lambda: splats
@@ -125,9 +128,6 @@ class AutogradPasses(_OneView):
     def _differentiate(self, dL_dcolor: torch.Tensor) -> None:
         self._seen = None  # which holds on to memory
         self._color.backward(dL_dcolor)
-        # A rasterizer that was given to the trainer may leave the gate without a gradient: it stays as it is.
-        if self.gate and self._gate_value is not None and self._gate_value.grad is not None:
-            self.gate.gradient = self._gate_value.grad
 
     @torch.enable_grad()
     def _add_gradient(self, name: str, number: float) -> None:

@@ -110,10 +110,10 @@ def test_a_mode_without_a_gate_is_baked_in_alpha_alone(smoe_run, tiny_scene, tmp
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_an_export_that_is_ended_leaves_nothing(smoe_run, tmp_path, capsys, monkeypatch, number):
+def test_an_export_that_is_ended_leaves_nothing(smoe_run, tmp_path, capsys, monkeypatch, request, number):
     """Neither a part of the file nor the baked model, whose folder is temporary."""
-    if signal.getsignal(number) != signal.SIG_DFL:
-        pytest.skip("started with this signal ignored, as by nohup, an export goes on")
+    earlier = signal.signal(number, signal.SIG_DFL)  # under nohup it is ignored, and an export goes on
+    request.addfinalizer(lambda: signal.signal(number, earlier))
     temporary, output = tmp_path / "temporary", tmp_path / "output"
     temporary.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
