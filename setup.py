@@ -29,7 +29,18 @@ USUAL_CARDS = (80, 90)
 SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
 # The oldest PyTorch whose stable ABI has what the ops take, as its headers write it, and the oldest Python of that one.
 STABLE_ABI_SINCE, TORCH_TARGET_VERSION, STABLE_PYTHON = "2.11", "0x020b000000000000", "cp310"
+# The folders at the top that are parts of packages, by the link that puts each there.
+LINKS = {"diff_smoe_rasterization/integrations": "../integrations", "dsmoe/patches": "../patches"}
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
+
+
+def restore_links(root):
+    """Makes the links anew that a .zip of the tree holds as text, which pip and Python's zipfile unpack as such."""
+    for link, target in LINKS.items():
+        path = Path(root, link)
+        if path.is_file():
+            path.unlink()
+            path.symlink_to(target, target_is_directory=True)
 
 
 def import_build_tools():
@@ -247,4 +258,5 @@ def commit():
 if __name__ == "__main__":
     if int(setuptools.__version__.split(".")[0]) < 61:  # it would ignore pyproject.toml and install "UNKNOWN 0.0.0"
         sys.exit(f"setuptools {setuptools.__version__} is too old; type: pip install 'setuptools>=61,<82'; build again")
+    restore_links(ROOT)
     setuptools.setup(**(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))

@@ -70,7 +70,7 @@ fingerprint() {
   (
     cd "$root" || exit
     {
-      find setup.py pyproject.toml CMakeLists.txt build_support diff_smoe_rasterization dsmoe \
+      find setup.py pyproject.toml CMakeLists.txt build_support diff_smoe_rasterization dsmoe integrations patches \
         -type f ! -name '*.py[co]' ! -name '*.so' ! -name _build_info.py -exec cksum {} + || true
       cat "$venv"/lib/python*/site-packages/torch/version.py || true
     } 2>/dev/null | LC_ALL=C sort

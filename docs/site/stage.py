@@ -51,7 +51,7 @@ def markdown_files() -> Iterator[Path]:
                                 stdout=subprocess.PIPE, universal_newlines=True).stdout.splitlines()
     except (OSError, subprocess.CalledProcessError):
         found = [*ROOT.glob("*.md")]
-        for name in ("docs", "examples", "benchmarks", "diff_smoe_rasterization", "dsmoe"):
+        for name in ("docs", "examples", "benchmarks", "integrations", "patches"):
             found += (ROOT / name).rglob("*.md")
         listed = [str(path.relative_to(ROOT)) for path in found]
     return (ROOT / name for name in sorted(listed) if (ROOT / name).is_file() and not name.startswith("tests/"))

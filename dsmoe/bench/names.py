@@ -20,7 +20,7 @@ SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")  # fields by whic
 NATIVE = "native"
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
 VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
-# Of each public trainer, whether it can be patched to this package's rasterizer (dsmoe/patches).
+# Of each public trainer, whether it can be patched to this package's rasterizer (patches).
 CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
              "2dgs": False, "dbs": False}
 WITHOUT_STRATEGY = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own

@@ -57,6 +57,21 @@ def load_setup():
     return module
 
 
+def test_links_of_the_tree_that_a_zip_left_as_text_are_made_again(tmp_path):
+    setup = load_setup()
+    links = [path for package in ("diff_smoe_rasterization", "dsmoe") for path in (ROOT / package).iterdir()
+             if path.is_symlink()]
+    assert {path.relative_to(ROOT).as_posix(): os.readlink(path) for path in links} == setup.LINKS
+    for link, target in setup.LINKS.items():
+        path = tmp_path / link
+        path.parent.mkdir()
+        path.write_text(target)
+        (tmp_path / path.name).mkdir()
+    for _ in range(2):
+        setup.restore_links(tmp_path)
+        assert all((tmp_path / link).samefile(tmp_path / Path(link).name) for link in setup.LINKS)
+
+
 def test_a_build_does_not_write_into_a_loaded_library(tmp_path):
     source, target = tmp_path / "built.so", tmp_path / "libdsmoe.so"
     source.write_text("new")
@@ -308,7 +323,8 @@ sys.exit(main(sys.argv[1:]))""")
 
 def test_the_rasterizer_loads_torch_and_numpy_only():
     """All of its modules are imported, in a new Python. What torch itself loads does not count."""
-    names = [".".join(path.relative_to(INSTALLED.parent).with_suffix("").parts) for path in INSTALLED.rglob("*.py")]
+    files = {*INSTALLED.rglob("*.py"), *(INSTALLED / "integrations").rglob("*.py")}  # rglob enters no link
+    names = [".".join(path.relative_to(INSTALLED.parent).with_suffix("").parts) for path in files]
     assert {"diff_smoe_rasterization.io", "diff_smoe_rasterization.integrations.inria"} <= {*names}
     program = f"""import importlib, sys
 import torch
@@ -326,7 +342,7 @@ print(*sorted({{"torch", "numpy", "scipy", "PIL", "tqdm", "dsmoe"}} & {{*sys.mod
 def test_no_module_of_the_rasterizer_names_another_package():
     """Not the trainer either, and not inside a function."""
     imported = set()
-    for path in SOURCE.rglob("*.py"):
+    for path in [*SOURCE.rglob("*.py"), *(ROOT / "integrations").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 imported |= {alias.name.partition(".")[0] for alias in node.names}

@@ -8,7 +8,7 @@ import torch
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS
 
-README = Path(__file__).resolve().parents[3] / "diff_smoe_rasterization" / "integrations" / "README.md"
+README = Path(__file__).resolve().parents[3] / "integrations" / "README.md"
 
 
 def test_the_examples_run():

@@ -1,7 +1,7 @@
 """The trainers that can be patched, as a table. It has names and structure, no line of a trainer.
 
 A checkout is the first trainer of TRAINERS that calls the rasterizer it calls and whose signs it shows; facts.py says
-what signs are. diff_smoe_rasterization/integrations/contracts.py is the table of rasterizers.
+what signs are. integrations/contracts.py is the table of rasterizers.
 """
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 From this table come the modules here, what `dsmoe run` answers for, how `dsmoe patch` tells trainers apart, and the
 table in README.md. A new rasterizer of Inria's kind is one entry, and a function in flavours.py where it does more. One
-that is imported by a name of its own also has a folder of that name in dsmoe/patches/shims.
+that is imported by a name of its own also has a folder of that name in patches/shims.
 """
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Contract(NamedTuple):
     settings: Tuple[str, ...] = ()  # behind `debug`
     arguments: Tuple[str, ...] = ARGUMENTS  # of a call, in order
     names: Tuple[str, ...] = ()  # that can be imported
-    signs: Tuple[str, ...] = ()  # a caller shows one of these (dsmoe/patches/facts.py); none: it needs to show nothing
+    signs: Tuple[str, ...] = ()  # a caller shows one of these (patches/facts.py); none: it needs to show nothing
     module: str = RASTERIZER  # what callers import
     other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings, or of a rasterizer beside it
     methods: Tuple[str, ...] = ()  # of a rasterizer, beside METHODS

@@ -38,7 +38,7 @@ USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its raster
 OF_GSPLAT = "gsplat"
 FOUR_COLUMNS = "means2D of four columns"
 MODULES = {contract.module: contract for contract in CONTRACTS if contract.module not in (RASTERIZER, OF_GSPLAT)}
-OF_ALL = "diff_smoe_rasterization/integrations/README.md lists all, and `dsmoe run --trainer list` their names"
+OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their names"
 
 
 def of_checkout(files: Mapping[str, bytes], script: str = "") -> Set[str]:
