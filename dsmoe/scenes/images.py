@@ -7,7 +7,7 @@ import io
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, BinaryIO, List, Optional, Sequence, Tuple, Union
+from typing import BinaryIO, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import torch
@@ -68,11 +68,13 @@ def open_image(file: Union[str, BinaryIO]) -> Image.Image:
     return Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN])
 
 
-def unreadable(path: str, error: Exception) -> SceneError:
-    """The error for a file whose reading raised one of UNREADABLE."""
+def unreadable(path: str, error: Exception, is_made: bool = False) -> SceneError:
+    """The error for a file whose reading raised one of UNREADABLE. is_made: whether this program has written it."""
+    reason = getattr(error, "strerror", None) or error
     if isinstance(error, UnidentifiedImageError):  # which names a buffer
-        return SceneError(f"{path}: not a readable image (it is none of {', '.join(FORMATS)})")
-    return SceneError(f"{path}: not a readable image ({getattr(error, 'strerror', None) or error})")
+        reason = f"it is none of {', '.join(FORMATS)}"
+    remedy = "; it is a copy without lens distortion: remove it, and the same command makes it anew" if is_made else ""
+    return SceneError(f"{path}: not a readable image ({reason}){remedy}")
 
 
 def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:
@@ -101,15 +103,26 @@ def load_views(images: Sequence[PosedImage], config: TrainConfig, progress: bool
 def load_view(posed: PosedImage, config: TrainConfig, checksum: bool) -> View:
     """Reads one image: transparency composited, then resized; the camera follows the size."""
     # Of the files, not of the pixels: another release of Pillow may decode the same JPEG to other pixels.
-    hashed = hashlib.sha256() if checksum else None
+    hashed = hashlib.sha256(posed.made_from.encode()) if checksum else None
+
+    def read(path: str) -> bytes:
+        content = read_content(path)
+        if hashed and not posed.made_from:
+            hashed.update(content)
+        return content
+
+    content = read(posed.path)
     try:
-        with open_image(_content(posed.path, hashed)) as file:
+        with open_image(io.BytesIO(content)) as file:
             image = composited(file, config.white_background)
             opacity = _opacity(file) if config.random_background else None
     except UNREADABLE as error:
-        raise unreadable(posed.path, error) from error
+        raise unreadable(posed.path, error, bool(posed.made_from)) from error
     camera = fitted_camera(posed, image.size, config)
-    mask = None if posed.mask is None else _mask(posed.mask, hashed, posed.path, image.size, camera)
+    mask = None
+    if posed.mask is not None:
+        own = read_mask(read(posed.mask), posed.mask, posed.path, image.size, bool(posed.made_from))
+        mask = _fitted_mask(own, posed, camera)
     try:
         return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask,
                     hashed.hexdigest() if hashed else "")
@@ -118,13 +131,13 @@ def load_view(posed: PosedImage, config: TrainConfig, checksum: bool) -> View:
                          "images (--resolution)") from error
 
 
-def _content(path: str, hashed: Any) -> BinaryIO:
-    """The content of a file, read once and added to the checksum, if there is one."""
-    with open(path, "rb") as file:
-        content = file.read()
-    if hashed:
-        hashed.update(content)
-    return io.BytesIO(content)
+def read_content(path: str) -> bytes:
+    """The content of an image's file. Raises SceneError."""
+    try:
+        with open(path, "rb") as file:
+            return file.read()
+    except OSError as error:
+        raise unreadable(path, error) from error
 
 
 def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -> torch.Tensor:
@@ -134,21 +147,27 @@ def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -
     return torch.from_numpy(np.atleast_3d(np.array(image))).permute(2, 0, 1).contiguous()
 
 
-def _mask(path: str, hashed: Any, image_path: str, size: Tuple[int, int], camera: Camera) -> torch.Tensor:
-    """[1, H, W] uint8: the mask of an image file of that size (width, height)."""
+def read_mask(content: bytes, path: str, image_path: str, size: Tuple[int, int], is_made: bool = False) -> Image.Image:
+    """The mask in a file of that content, in grey, of an image file of that size (width, height). Raises SceneError."""
     try:
-        with open_image(_content(path, hashed)) as file:
+        with open_image(io.BytesIO(content)) as file:
             mask = composited(file, white=False).convert("L")
     except UNREADABLE as error:
-        raise unreadable(path, error) from error
+        raise unreadable(path, error, is_made) from error
     if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > MAX_ASPECT_ERROR:
         raise SceneError(f"{path}: the mask is {mask.width}x{mask.height}, its image {image_path} "
                          f"{size[0]}x{size[1]}: another shape")
     if mask.getextrema()[1] == 1:
         raise SceneError(f"{path}: the mask has the values 0 and 1; white, which counts, must be 255")
+    return mask
+
+
+def _fitted_mask(mask: Image.Image, posed: PosedImage, camera: Camera) -> torch.Tensor:
+    """[1, H, W] uint8: the mask in the camera's size."""
     planes = _planes(mask, camera, Image.BILINEAR)  # which does not overshoot at edges
     if not bool(planes.any()):
-        raise SceneError(f"{path}: the mask keeps no pixel of {image_path}; white is what counts, black is ignored")
+        raise SceneError(f"{posed.mask}: the mask keeps no pixel of {posed.path}; white is what counts, black is "
+                         "ignored")
     return planes
 
 
@@ -167,11 +186,16 @@ def fitted_camera(posed: PosedImage, size: Tuple[int, int], config: TrainConfig)
     return camera.centred() if config.principal_point == "centre" else camera
 
 
-def composited(image: Image.Image, white: bool) -> Image.Image:
-    """The image as RGB; where it has transparency, over white or black. Raises ValueError beyond 8 bits a channel."""
+def check_depth(image: Image.Image) -> None:
+    """Raises ValueError beyond 8 bits a channel."""
     if image.mode == "F" or image.mode.startswith("I"):
         raise ValueError(f"its pixels have more than 8 bits (Pillow's mode {image.mode}); convert it to 8 bits")
-    if not _is_transparent(image):
+
+
+def composited(image: Image.Image, white: bool) -> Image.Image:
+    """The image as RGB; where it has transparency, over white or black. Raises ValueError beyond 8 bits a channel."""
+    check_depth(image)
+    if not is_transparent(image):
         return image.convert("RGB")
     rgba = np.asarray(image.convert("RGBA"), np.float32) / 255
     color, alpha = rgba[..., :3], rgba[..., 3:]
@@ -179,18 +203,28 @@ def composited(image: Image.Image, white: bool) -> Image.Image:
     return Image.fromarray((blended * 255).round().astype(np.uint8))
 
 
-def _is_transparent(image: Image.Image) -> bool:
+def is_transparent(image: Image.Image) -> bool:
+    """Whether the file has an alpha plane, or a colour that stands for one."""
     return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 
 
 def _opacity(image: Image.Image) -> Optional[Image.Image]:
-    return image.convert("RGBA").getchannel("A") if _is_transparent(image) else None
+    return image.convert("RGBA").getchannel("A") if is_transparent(image) else None
 
 
 def image_size(path: str) -> Tuple[int, int]:
     """(width, height) from an image's header. Raises SceneError."""
+    return _size(path, path)
+
+
+def size_of(content: bytes, path: str) -> Tuple[int, int]:
+    """(width, height) of the image in a file of that content. Raises SceneError."""
+    return _size(io.BytesIO(content), path)
+
+
+def _size(source: Union[str, BinaryIO], path: str) -> Tuple[int, int]:
     try:
-        with open_image(path) as file:
+        with open_image(source) as file:
             return file.size
     except UNREADABLE as error:
         raise unreadable(path, error) from error

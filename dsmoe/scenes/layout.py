@@ -23,6 +23,7 @@ class PosedImage:
     path: str
     mask: Optional[str] = None  # the file that says which pixels count
     lens: Optional[Lens] = None  # what bends the image; the camera is the pinhole camera without it
+    made_from: str = ""  # where image and mask are copies without distortion: a checksum of what they are made from
 
 
 @dataclass(frozen=True)

@@ -4,27 +4,63 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import io
 import os
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, List, Sequence, Tuple
 
 import numpy as np
 from PIL import Image
 
 from ..errors import SceneError
-from ..system.files import is_file
+from ..system.files import is_file, remove_unfinished, write_atomically
 from ..system.process import pip_install
 from ..system.progress import progress_bar
 from .cameras import Camera
-from .images import UNREADABLE, image_size, open_image, unreadable
+from .images import (
+    UNREADABLE,
+    check_depth,
+    is_transparent,
+    open_image,
+    read_content,
+    read_mask,
+    size_of,
+    unreadable,
+)
 from .layout import Layout, PosedImage
 from .lens import Lens
 
 CACHE_VARIABLE = "DSMOE_CACHE"  # a folder for undistorted images, in place of the scene's own
 CACHE_NAME = ".dsmoe_cache"  # of a scene's folder
-VERSION = 1  # of what is done here; another one is another file
+VERSION = 2  # of what is done here; another one is another file
 SAMPLES = 4096  # of the distortion along a radius
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a bent image becomes: where that is kept, by what it is made of."""
+
+    bent: PosedImage
+    camera: Camera  # of the pinhole image: the file's size
+    content: str  # checksum of the image's file
+    mask_content: str  # and of its own mask's; empty where it has none
+    path: str  # the pinhole image
+    mask: str  # which of its pixels count; where all do, `_all(mask)` is there in its place
+
+    @property
+    def has_image(self) -> bool:
+        return is_file(self.path)
+
+    @property
+    def has_mask(self) -> bool:
+        return is_file(self.mask) or is_file(_all(self.mask))
+
+    def done(self) -> PosedImage:
+        """The pinhole image, which is there."""
+        made_from = _checksum(repr((self.bent.lens, self.content, self.mask_content)).encode())
+        return dataclasses.replace(self.bent, camera=self.camera, path=self.path, lens=None, made_from=made_from,
+                                   mask=self.mask if is_file(self.mask) else None)
 
 
 def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str]:
@@ -43,13 +79,26 @@ def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str
                          f"removes it: {pip_install('opencv-python-headless')}, then type the same command")
     folder = cache_folder(scene)
     os.makedirs(folder, exist_ok=True)
-    new = sum(not is_file(_image_path(image, folder)) for image in bent)
+    remove_unfinished(folder)
     with ThreadPoolExecutor(min(8, 2 * (os.cpu_count() or 1))) as pool:
-        working = pool.map(lambda image: _undistorted_image(image, folder) if image.lens else image, images)
-        done = list(progress_bar(working, total=len(images), desc="undistortion", unit="image", leave=False,
-                                 disable=not progress or not new))
+        plans = list(pool.map(lambda image: _plan(image, folder), bent))
+        makes_image = {plan.path: plan for plan in plans if not plan.has_image}  # one plan for each file
+        makes_mask = {plan.mask: plan for plan in plans if not plan.has_mask}
+        new = sum(plan.path in makes_image or plan.mask in makes_mask for plan in plans)
+
+        def work(plan: _Plan) -> None:
+            if makes_mask.get(plan.mask) is plan:
+                _make_mask(plan)
+            if makes_image.get(plan.path) is plan:
+                _make_image(plan)
+
+        for _ in progress_bar(pool.map(work, plans), total=len(plans), desc="undistortion", unit="image", leave=False,
+                              disable=not progress or not new):
+            pass
     for kept in (_maps, _valid):  # they are as large as images
         kept.cache_clear()
+    made = iter([plan.done() for plan in plans])
+    done = [next(made) if image.lens else image for image in images]
     train, test = done[:len(layout.train)], done[len(layout.train):]
     masked = ", pixels beyond the lens are masked" if any(image.mask for image in done) else ""
     said = (f"{len(bent)} images of camera model {models} are undistorted by OpenCV ({new} of them now) in "
@@ -77,68 +126,73 @@ def _opencv() -> Any:
     return cv2
 
 
-def _image_path(image: PosedImage, folder: str) -> str:
-    return os.path.join(folder, _name(_intrinsics(image.camera), image.lens, image.camera.name, _state(image.path)))
-
-
-def _mask_path(image: PosedImage, folder: str, camera: Camera) -> str:
-    """Images of one camera share the mask, but where they have masks of their own."""
-    own = (image.camera.name, _state(image.mask)) if image.mask else ()
-    return os.path.join(folder, "mask-" + _name(_intrinsics(camera), image.lens, *own))
+def _plan(image: PosedImage, folder: str) -> _Plan:
+    """Reads the image and its mask, since size and time of a file may stay where its content changes."""
+    content = read_content(image.path)
+    camera = image.camera.resized(*size_of(content, image.path))
+    own = _checksum(content)
+    own_mask = _checksum(read_content(image.mask)) if image.mask else ""
+    pinhole = (VERSION, _intrinsics(camera), image.lens)
+    # Images of one camera share the mask, but where they have masks of their own.
+    return _Plan(image, camera, own, own_mask, os.path.join(folder, _name(*pinhole, own)),
+                 os.path.join(folder, "mask-" + _name(*pinhole, own_mask)))
 
 
 def _intrinsics(camera: Camera) -> Tuple[float, ...]:
     return (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
-def _state(path: str) -> Tuple[int, int]:
-    """What changes with the content of a file."""
-    status = os.stat(path)
-    return status.st_size, status.st_mtime_ns
-
-
 def _name(*what: Any) -> str:
-    return hashlib.sha256(repr((VERSION, what)).encode()).hexdigest()[:20] + ".png"
+    return _checksum(repr(what).encode())[:20] + ".png"
 
 
-def _undistorted_image(image: PosedImage, folder: str) -> PosedImage:
-    """The image without distortion; a mask is written before its image, which so tells that both are there."""
-    path = _image_path(image, folder)
-    camera = image.camera.resized(*image_size(image.path))
-    mask = _mask_path(image, folder, camera)
-    if not is_file(path):
-        bent = _read(image.path)
-        valid = _valid(_intrinsics(camera), image.lens)
-        if image.mask:
-            own = _read(image.mask).convert("L").resize(bent.size, Image.BILINEAR)
-            valid = np.where(valid, np.asarray(_remapped(own, camera, image.lens)), 0).astype(np.uint8)
-        if not valid.all() or image.mask:
-            _write(Image.fromarray(valid.astype(np.uint8) * (1 if image.mask else 255)), mask)
-        _write(_remapped(bent, camera, image.lens), path)
-    return dataclasses.replace(image, camera=camera, path=path, lens=None, mask=mask if is_file(mask) else None)
+def _checksum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
-def _read(path: str) -> Image.Image:
+def _all(mask: str) -> str:
+    """The name of an empty file that says: all pixels count. A mask that is missing says nothing."""
+    return os.path.splitext(mask)[0] + ".all"
+
+
+def _make_image(plan: _Plan) -> None:
+    content = _unchanged(plan.bent.path, plan.content)
     try:
-        with open_image(path) as file:
-            if file.mode == "F" or file.mode.startswith("I"):
-                raise ValueError(f"its pixels have more than 8 bits (Pillow's mode {file.mode}); convert it to 8 bits")
-            has_alpha = file.mode in ("RGBA", "LA", "PA") or "transparency" in file.info
-            return file.convert("RGBA" if has_alpha else "RGB")
+        with open_image(io.BytesIO(content)) as file:
+            check_depth(file)
+            bent = file.convert("RGBA" if is_transparent(file) else "RGB")
     except UNREADABLE as error:
-        raise unreadable(path, error) from error
+        raise unreadable(plan.bent.path, error) from error
+    _write(_remapped(bent, plan.camera, plan.bent.lens), plan.path)
+
+
+def _make_mask(plan: _Plan) -> None:
+    valid = _valid(_intrinsics(plan.camera), plan.bent.lens)
+    if plan.bent.mask:
+        size = (plan.camera.width, plan.camera.height)
+        own = read_mask(_unchanged(plan.bent.mask, plan.mask_content), plan.bent.mask, plan.bent.path, size)
+        kept = np.asarray(_remapped(own.resize(size, Image.BILINEAR), plan.camera, plan.bent.lens))
+        valid = np.where(valid, kept, 0).astype(np.uint8)
+        if not valid.any():
+            raise SceneError(f"{plan.bent.mask}: the mask keeps no pixel of {plan.bent.path} without lens distortion")
+    else:
+        valid = valid.astype(np.uint8) * 255
+    if valid.min() == 255:
+        write_atomically(_all(plan.mask), lambda file: None)
+    else:
+        _write(Image.fromarray(valid), plan.mask)
+
+
+def _unchanged(path: str, checksum: str) -> bytes:
+    """The content of a file, which must be that of the plan. Raises SceneError."""
+    content = read_content(path)
+    if _checksum(content) != checksum:
+        raise SceneError(f"{path} has changed while the scene was loaded; type the same command again")
+    return content
 
 
 def _write(image: Image.Image, path: str) -> None:
-    """Writes a PNG that is whole or absent, whoever else writes the same."""
-    handle, temporary = tempfile.mkstemp(dir=os.path.dirname(path), suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            image.save(file, "PNG", compress_level=1)
-        os.replace(temporary, path)
-    except BaseException:
-        os.remove(temporary)
-        raise
+    write_atomically(path, lambda file: image.save(file, "PNG", compress_level=1))
 
 
 def _remapped(image: Image.Image, camera: Camera, lens: Lens) -> Image.Image:

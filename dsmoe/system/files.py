@@ -80,10 +80,7 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
     check_output(path, overwrite)
     folder, name = os.path.split(os.path.abspath(path))
     os.makedirs(folder, exist_ok=True)
-    for left in glob.glob(os.path.join(glob.escape(folder), f"{PART}*-{glob.escape(name)}")):
-        number = os.path.basename(left)[len(PART):].partition("-")[0]
-        if number.isdigit() and not _runs(int(number)):
-            _remove(left)
+    remove_unfinished(folder, name)
     temporary = os.path.join(folder, f"{PART}{os.getpid()}-{name}")
     _remove(temporary)  # of a process that had this number
     try:
@@ -96,6 +93,14 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
         raise
     finally:
         _remove(temporary)
+
+
+def remove_unfinished(folder: str, name: Optional[str] = None) -> None:
+    """Removes what killed processes have left in a folder, of all files or of those with one name."""
+    for left in glob.glob(os.path.join(glob.escape(folder), f"{PART}*-{glob.escape(name) if name else '*'}")):
+        number = os.path.basename(left)[len(PART):].partition("-")[0]
+        if number.isdigit() and not _runs(int(number)):
+            _remove(left)
 
 
 def _remove(path: str) -> None:

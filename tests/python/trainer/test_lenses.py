@@ -5,6 +5,7 @@ import json
 import math
 import os
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from dsmoe.errors import SceneError
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
+from dsmoe.system.files import PART
 
 WIDTH, HEIGHT = 96, 72
 FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0
@@ -129,7 +131,7 @@ def test_undistorted_images_are_kept_and_made_anew_where_something_changes(tmp_p
     config = TrainConfig(scene=folder)
     first = load(folder)
     kept = sorted(os.listdir(scene / ".dsmoe_cache"))
-    assert len(kept) == 4 and sum(name.startswith("mask-") for name in kept) == 1, "images of a camera share a mask"
+    assert len(kept) == 2 and sum(name.startswith("mask-") for name in kept) == 1, "equal images share image and mask"
     told = describe_scene(first, read_layout(config), config).splitlines()[1]
     assert told == ("3 images of camera model OPENCV are undistorted by OpenCV (3 of them now) in "
                     f"{scene}/.dsmoe_cache, pixels beyond the lens are masked")
@@ -143,6 +145,108 @@ def test_undistorted_images_are_kept_and_made_anew_where_something_changes(tmp_p
     assert "(3 of them now)" in load(folder).note and len(os.listdir(tmp_path / "elsewhere")) == 1
     known, loaded = load_cameras(config, "train")[0], changed.train[0].camera
     assert (known.name, known.fx, known.cy, known.width) == (loaded.name, loaded.fx, loaded.cy, loaded.width)
+
+
+def half_mask(folder, right=True, name="0.png"):
+    """masks/NAME of a scene whose other masks are white: only one half of that image counts."""
+    os.makedirs(folder / "masks", exist_ok=True)
+    for index in range(3):
+        mask = Image.new("L", (WIDTH, HEIGHT), 255)
+        if f"{index}.png" == name:
+            mask.paste(0, (0, 0, WIDTH // 2, HEIGHT) if right else (WIDTH // 2, 0, WIDTH, HEIGHT))
+        mask.save(folder / "masks" / f"{index}.png")
+
+
+def left_and_right(view):
+    """How much of the pixels near the left and the right border counts."""
+    mask = view.mask_float()
+    return float(mask[0, 20:-20, 10:20].mean()), float(mask[0, 20:-20, -20:-10].mean())
+
+
+@needs_opencv
+@pytest.mark.parametrize("coefficients", [[0.2, 0.05, 0, 0], [-0.1, 0, 0, 0]], ids=["lens masks", "lens shows all"])
+def test_what_is_made_from_a_mask_follows_the_mask(tmp_path, coefficients):
+    """Added, edited and removed behind the cache; the pixels beyond the lens stay masked all along."""
+    image = Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90))
+    folder = write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, *coefficients], image)
+    own = load(folder).test[0].mask
+    assert (own is None) == (coefficients[0] < 0)
+    half_mask(tmp_path)
+    assert left_and_right(load(folder).test[0]) == (0, 1)
+    before = [os.stat(tmp_path / "masks" / name) for name in ("0.png", "1.png")]
+    half_mask(tmp_path, right=False)
+    for name, status in zip(("0.png", "1.png"), before):
+        os.utime(tmp_path / "masks" / name, ns=(status.st_atime_ns, status.st_mtime_ns))
+    scene = load(folder)
+    assert left_and_right(scene.test[0]) == (1, 0)
+    beyond = slice(None) if own is None else own == 0
+    if own is not None:
+        assert beyond.any() and not scene.test[0].mask[beyond].any() and not scene.train[0].mask[beyond].any()
+    shutil.rmtree(tmp_path / "masks")
+    again = load(folder).test[0].mask
+    assert own is None and again is None or (again == own).all()
+
+
+@needs_opencv
+def test_the_cache_is_of_what_files_hold(tmp_path):
+    """Neither size nor time of a file says what it holds, and each file of the cache is missed by itself."""
+    folder = write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, 0.2, 0.05, 0, 0], Image.new("RGB", (WIDTH, HEIGHT)))
+    bitmap = tmp_path / "images" / "1.png"
+    Image.new("RGB", (WIDTH, HEIGHT), (9, 9, 9)).save(bitmap, "BMP")  # of one size whatever it holds
+    first, status = load(folder), os.stat(bitmap)
+    checksums = [view.checksum for view in first.train]
+    Image.new("RGB", (WIDTH, HEIGHT), (8, 8, 8)).save(bitmap, "BMP")
+    os.utime(bitmap, ns=(status.st_atime_ns, status.st_mtime_ns))
+    now = os.stat(bitmap)
+    assert (now.st_size, now.st_mtime_ns) == (status.st_size, status.st_mtime_ns)
+    changed = load(folder)
+    assert (changed.train[0].image == 8).all() and [view.checksum for view in changed.train] != checksums
+    cache = tmp_path / ".dsmoe_cache"
+    shutil.rmtree(cache)  # the first image's too
+    load(folder)
+    for name in sorted(os.listdir(cache)):
+        content = (cache / name).read_bytes()
+        os.remove(cache / name)
+        again = load(folder)
+        assert (cache / name).read_bytes() == content, name
+        assert (again.train[0].mask == changed.train[0].mask).all()
+        (cache / name).write_bytes(content[:len(content) // 2])
+        with pytest.raises(SceneError, match=f"{name}: not a readable image .*: remove it, and the same command"):
+            load(folder)
+        (cache / name).write_bytes(content)
+    assert [view.checksum for view in load(folder).train] == [view.checksum for view in changed.train]
+
+
+@needs_opencv
+def test_files_of_the_cache_have_the_usual_rights_and_what_a_kill_left_goes(tmp_path):
+    folder = write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, 0.2, 0.05, 0, 0], Image.new("RGB", (WIDTH, HEIGHT)))
+    cache = tmp_path / ".dsmoe_cache"
+    cache.mkdir()
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    (cache / f"{PART}{ended.pid}-0123.png").write_bytes(b"half")
+    (cache / f"{PART}{os.getppid()}-0123.png").write_bytes(b"another process writes it")
+    before = os.umask(0o027)
+    try:
+        load(folder)
+    finally:
+        os.umask(before)
+    left = [name for name in os.listdir(cache) if name.startswith(PART)]
+    assert left == [f"{PART}{os.getppid()}-0123.png"]
+    assert {os.stat(cache / name).st_mode & 0o777 for name in {*os.listdir(cache)} - {*left}} == {0o640}
+
+
+@needs_opencv
+def test_masks_before_a_lens_are_refused_as_without_one(tmp_path):
+    folder = write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, 0.2, 0.05, 0, 0], Image.new("RGB", (WIDTH, HEIGHT)))
+    for mask, words in ((Image.new("L", (HEIGHT, WIDTH), 255), "the mask is 72x96.*another shape"),
+                        (Image.new("L", (WIDTH, HEIGHT), 1), "values 0 and 1"),
+                        (Image.new("L", (WIDTH, HEIGHT), 0), "keeps no pixel"),
+                        (Image.new("LA", (WIDTH, HEIGHT), (255, 0)), "keeps no pixel")):
+        half_mask(tmp_path)
+        mask.save(tmp_path / "masks" / "0.png")
+        with pytest.raises(SceneError, match=f"masks/0.png: .*{words}"):
+            load(folder)
 
 
 @needs_opencv

@@ -482,7 +482,7 @@ def test_a_format_that_runs_another_program_is_refused(colmap_folder, monkeypatc
     Image.new("RGB", (32, 24)).save(path, format="EPS")
     refused(colmap_folder, "view_004.png", "not a readable image")
     with pytest.raises(SceneError, match="view_004.png: not a readable image"):
-        undistortion._read(path)
+        undistortion._plan(PosedImage(read_layout(TrainConfig(scene=colmap_folder)).train[0].camera, path), "")
     assert not ran
     Image.new("RGB", (32, 24)).save(path, format="JPEG")
     load(colmap_folder)
