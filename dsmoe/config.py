@@ -27,6 +27,7 @@ CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.pt"  # beside it
 STRATEGY_NAMES = ("3dgs", "steady", "importance", "mcmc")
 BATCHED = ("3dgs", "steady")  # the strategies that train on batches of views, and on several GPUs
+IMAGES = "images"  # folder of a COLMAP scene
 PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
@@ -76,7 +77,8 @@ class TrainConfig:
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
     resolution: int = _option(
         -1, "1, 2, 4, 8: divide the image size by it; -1: cap the width at 1600; else the width in pixels")
-    images: str = _option("images", "image folder inside a COLMAP scene")
+    images: str = _option(IMAGES, "image folder inside a COLMAP scene")
+    strict: bool = _option(False, "an image that the scene names and has not is an error; else it is left out")
     principal_point: str = _option(
         "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
         choices=PRINCIPAL_POINTS)
@@ -317,7 +319,7 @@ class TrainConfig:
     def differences(self, later: TrainConfig) -> List[str]:
         """Options that keep `later` from continuing this run, one text each; more iterations do not."""
         # These alter when something is written or where, never the trained Gaussians.
-        harmless = {"scene", "output", "eval_every", "checkpoint_every"}
+        harmless = {"scene", "output", "strict", "eval_every", "checkpoint_every"}
         if later.iterations > self.iterations:
             harmless.add("iterations")
         if self.blend_mode != later.blend_mode:  # what follows from that needs no text of its own

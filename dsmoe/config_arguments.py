@@ -12,7 +12,7 @@ from .errors import ConfigError
 
 # How `--help` groups the options; those that no group names are of the last one.
 GROUPS = {
-    "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
+    "scene": ("images", "strict", "resolution", "test_every", "principal_point", "init_points", "white_background",
               "random_background"),
     "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
     "length, and number of Gaussians": ("iterations", "batch", "budget", "strategy", "strategy_options"),

@@ -21,7 +21,7 @@ from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
 from .results.video import check_folder
 from .scenes.cameras import Camera
-from .scenes.scene import Scene, difference_of, load_cameras, load_scene
+from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
 from .system.device import check_device
 from .system.files import write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
@@ -37,19 +37,20 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
                  measure: Measure = image_metrics) -> Dict[str, Any]:
     """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
 
-    scene_folder: where the scene lies, if not where it was trained. Where it is another scene, or that is not known, a
-    line says so; another scene's row is not written. measure: as in `evaluate`. A folder that cannot be written to is
-    told, no error. Raises TrainerError.
+    scene_folder: where the scene lies, if not where it was trained. Where it is another scene, as one that has changed
+    since, or that is not known, a line says so; another scene's row is not written. measure: as in `evaluate`. A
+    folder that cannot be written to is told, no error. Raises TrainerError.
     """
     options = {"scene": scene_folder} if scene_folder else {}
     config = TrainConfig.of_run(output, "--scene", device=device, **options)
     check_device(device)
     ply = trained_model_path(output, config.iterations)
     earlier = [row for row in read_results(output) if _is_of(row, config)]
-    scene = load_scene(config, progress, checksums=bool(scene_folder)).to(device)
-    note, is_other = _compared(scene, config) if scene_folder else ("", False)
-    if note:
-        print(note)
+    layout = read_layout(config)
+    scene = load_scene(config, progress, layout).to(device)
+    note, is_other = _compared(scene, config)
+    for line in filter(None, (layout.warning, note)):
+        print(line)
     renderer = open_renderer(config, ply, config.blend_mode, device, rasterize, _gate_of(config))
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:

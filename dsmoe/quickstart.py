@@ -14,7 +14,7 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from .config import TrainConfig, flags_text
+from .config import IMAGES, TrainConfig, flags_text
 from .config_arguments import add_arguments
 from .errors import TrainerError, in_one_line
 from .inspection import open_renderer, to_image
@@ -149,7 +149,10 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
 
     The recipe's milestones keep their share of the iterations (`TrainConfig.shortened`).
     """
-    layout = read_layout(TrainConfig(scene=folder))
+    layout = read_layout(TrainConfig(scene=folder, images=given.get("images", IMAGES),
+                                     strict=given.get("strict", False)))
+    if layout.warning:
+        print(layout.warning, flush=True)
     device = given.get("device", "cpu")
     chosen = short_run(device, *image_size(layout.train[0].path), len(layout.points.positions))
     chosen = {name: value for name, value in chosen.items() if name not in given}

@@ -50,7 +50,7 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
         checkpoint_every=protocol["checkpoint_every"])
     if protocol["scale_recipe"]:
         config = config.shortened()
-    return config.changed(**protocol["options"])
+    return config.changed(**{"strict": True, **protocol["options"]})
 
 
 def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Dict[str, Any]:

@@ -47,6 +47,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["recipe"] = config.unusual_recipe()
     if config.random_background:
         unusual["random_background"] = True
+    if scene.missing:
+        unusual["images_left_out"] = scene.missing
     if scene.note:
         unusual["undistortion"] = "by OpenCV, bicubic; focal lengths, principal points and sizes stay"
     if any(view.mask is not None for view in views):

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import List, Optional, Sequence, Tuple
 
-from ..errors import SceneError
+from ..errors import SceneError, printable
 from ..system.files import is_file, is_folder
 from .cameras import Camera
 from .lens import Lens
@@ -35,6 +35,17 @@ class Layout:
     test: Sequence[PosedImage]
     points: PointCloud
     split: str  # how test images are chosen, for the protocol
+    missing: Sequence[str] = ()  # images that the folder names and has not, by name; they are in neither list
+
+    @property
+    def warning(self) -> str:
+        """A line about missing images; empty where there are none."""
+        if not self.missing:
+            return ""
+        every = len(self.missing) + len(self.train) + len(self.test)
+        more = ", ..." if self.missing[3:] else ""
+        return (f"warning: {len(self.missing)} of {every} images are missing and left out: "
+                f"{printable(', '.join(self.missing[:3]))}{more}; --strict refuses such a scene")
 
 
 def hold_out(images: Sequence[PosedImage], every: int = 8) -> Tuple[List[PosedImage], List[PosedImage], str]:
@@ -50,11 +61,19 @@ def hold_out(images: Sequence[PosedImage], every: int = 8) -> Tuple[List[PosedIm
     return train, ordered[::every], f"sorted by name, every {ordinal} is a test image"
 
 
-def check_files(paths: Sequence[str]) -> None:
-    """Raises SceneError naming the first missing image and how many are missing."""
-    missing = [path for path in paths if not is_file(path)]
-    if missing:
-        raise SceneError(f"{missing[0]}: no such image ({len(missing)} of {len(paths)} images are missing)")
+def without_missing(folder: str, layout: Layout, strict: bool) -> Layout:
+    """The layout without images whose files are not there; what is a test image does not change by that.
+
+    Raises SceneError where all training images are missing, with `strict` where any image is.
+    """
+    every = [*layout.train, *layout.test]
+    missing = [image for image in every if not is_file(image.path)]
+    train, test = ([image for image in images if is_file(image.path)] for images in (layout.train, layout.test))
+    if missing and (strict or not train):
+        rather = "; without --strict they are left out" if train else ""
+        raise SceneError(f"{missing[0].path}: no such image ({len(missing)} of {len(every)} images of {folder} are "
+                         f"missing{rather})")
+    return dataclasses.replace(layout, train=train, test=test, missing=[image.camera.name for image in missing])
 
 
 def with_masks(folder: str, layout: Layout) -> Layout:

@@ -160,9 +160,8 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
     if matrix.shape != (4, 4) or not np.abs(matrix).max() <= LARGEST:
         raise SceneError(f"{where}: `transform_matrix` must be 4 rows of 4 numbers of at most {LARGEST:g}")
     image_path = _image_path(folder, frame["file_path"])
-    if not is_file(image_path):
-        raise SceneError(f"{image_path}: no such image (named by frame {index} of {json_path})")
-    width, height = image_size(image_path)
+    is_there = is_file(image_path)  # else `without_missing` takes it out again
+    width, height = image_size(image_path) if is_there else (1, 1)
 
     def number(key: str, default: float) -> float:
         value = frame.get(key, content.get(key, default))
@@ -199,7 +198,7 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
     lens = _lens(frame.get("camera_model", content.get("camera_model")), content.get("is_fisheye") is True,
                  {key: number(key, 0) for key in DISTORTION}, where)
     mask = frame.get("mask_path")
-    if mask is None:
+    if mask is None or not is_there:
         return PosedImage(camera, image_path, lens=lens)
     if not isinstance(mask, str) or not is_file(os.path.join(folder, mask)):
         raise SceneError(f"{where}: `mask_path` is {reprlib.repr(mask)}: no such file")

@@ -9,18 +9,19 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+import sys
 from dataclasses import dataclass
-from typing import Any, Dict, Iterable, List, Mapping, Optional, Sequence
+from typing import Any, Dict, Hashable, Iterable, List, Mapping, Optional, Sequence
 
 import numpy as np
 
-from ..config import TrainConfig
+from ..config import IMAGES, TrainConfig
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import MAX_WIDTH, View, fitted_camera, image_size, load_views
-from .layout import Layout, check_files, with_masks
+from .layout import Layout, PosedImage, with_masks, without_missing
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
 from .undistortion import undistorted
@@ -37,6 +38,7 @@ class Scene:
     extent: float  # world units
     split: str
     note: str = ""  # what was done to its images, in a line
+    missing: int = 0  # images that were left out
 
     def to(self, device: str) -> Scene:
         """The same scene with its images on `device`."""
@@ -57,7 +59,7 @@ def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layo
     train, test = images[:len(layout.train)], images[len(layout.train):]
     points = layout.points.subset(config.init_points, config.seed).subset(config.most_points, config.seed)
     extent = scene_extent(np.stack([view.camera.center for view in train]))
-    return Scene(layout.kind, train, test, points, extent, layout.split, note)
+    return Scene(layout.kind, train, test, points, extent, layout.split, note, len(layout.missing))
 
 
 def read_layout(config: TrainConfig) -> Layout:
@@ -76,12 +78,15 @@ def read_layout(config: TrainConfig) -> Layout:
         raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
                          "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
                          "`dsmoe scene PHOTOS -o SCENE` makes a scene")
+    if layout.kind != "colmap" and config.images != IMAGES:
+        raise SceneError(f"scene {folder}: --images is {config.images!r}, which is for a COLMAP scene; "
+                         f"{'transforms_train.json' if layout.kind == 'nerf-synthetic' else TRANSFORMS} says where its "
+                         "images are")
+    layout = without_missing(folder, layout, config.strict)
     if not layout.train:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split}); "
                          "--test-every 0 keeps none for testing")
-    _check_images(folder, layout)
-    check_files([image.path for image in list(layout.train) + list(layout.test)])
-    return with_masks(folder, layout)
+    return with_masks(folder, _checked(folder, layout))
 
 
 def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
@@ -95,7 +100,7 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     count, there = len(scene.points.positions), len(layout.points.positions)
     points = f"{count:,} points" if count == there else f"{count:,} of {there:,} points"
     return (f"{len(scene.train)} training and {len(scene.test)} test images ({scene.split}), {size} pixels, {points} "
-            "to start from" + (f"\n{scene.note}" if scene.note else ""))
+            "to start from" + "".join(f"\n{line}" for line in (layout.warning, scene.note) if line))
 
 
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
@@ -158,21 +163,36 @@ def _checksum(content: bytes) -> str:
 def load_cameras(config: TrainConfig, split: str) -> List[Camera]:
     """The cameras of "train", "test" or "all" images at the config's resolution; images are not decoded."""
     layout = read_layout(config)
+    if layout.warning:
+        print(layout.warning, file=sys.stderr)
     posed = {"train": layout.train, "test": layout.test, "all": list(layout.train) + list(layout.test)}[split]
     return [fitted_camera(image, image_size(image.path), config) for image in posed]
 
 
-def _check_images(folder: str, layout: Layout) -> None:
-    """Raises SceneError for an image that is listed twice, and for a camera that float32 cannot hold."""
+def _identity(image: PosedImage) -> Hashable:
+    """What two paths to one file have in common, also by links."""
+    status = os.stat(image.path)
+    return (status.st_dev, status.st_ino) if status.st_ino else os.path.realpath(image.path)
+
+
+def _checked(folder: str, layout: Layout) -> Layout:
+    """The layout, with what its split leaves unsaid.
+
+    Raises SceneError for an image that is there twice, by whatever path, and for a camera that float32 cannot hold.
+    """
     every = [*layout.train, *layout.test]
-    # The two files of NeRF-synthetic may list the same images.
-    for images in (every,) if layout.kind == "colmap" else (layout.train, layout.test):
-        seen = set()
+    both = {*map(_identity, layout.train)} & {*map(_identity, layout.test)}
+    if both and layout.kind == "nerf-synthetic":  # each of its files may list any images
+        layout = dataclasses.replace(layout, split=f"{layout.split}, {len(both)} of which are training images too")
+    for images in (layout.train, layout.test) if layout.kind == "nerf-synthetic" else (every,):
+        seen: Dict[Hashable, str] = {}
         for image in images:
-            path = os.path.normpath(image.path)
-            if path in seen:
-                raise SceneError(f"scene {folder}: the image {image.camera.name} is listed twice, with a pose each")
-            seen.add(path)
+            name, file = image.camera.name, _identity(image)
+            if file in seen:
+                also = f" (also as {seen[file]})" if seen[file] != name else ""
+                raise SceneError(f"scene {folder}: the image {name} is listed twice{also}; each must be listed once, "
+                                 "to train on or to test")
+            seen[file] = name
     for image in every:
         camera = image.camera
         numbers = [*camera.translation, camera.fx, camera.fy, camera.cx, camera.cy]
@@ -180,3 +200,4 @@ def _check_images(folder: str, layout: Layout) -> None:
             raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
                              f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
                              f"{LARGEST:g}")
+    return layout

@@ -260,18 +260,47 @@ def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys)
     assert "nowhere" in fails(capsys, "eval", run, "--scene", str(tmp_path / "nowhere"))
 
 
-def test_eval_says_where_it_measures_another_scene(trained, scene, tmp_path, capsys):
+def darken(folder):
+    image = os.path.join(folder, "images", "view_003.png")
+    Image.open(image).point(lambda value: value // 2).save(image)
+
+
+def double_the_focal_length(folder):
+    model = io.read_colmap(folder)
+    model.cameras[1].params[:2] *= 2
+    io.write_colmap(model.folder, model, text=True)
+
+
+def remove_an_image(folder):
+    os.remove(os.path.join(folder, "images", "view_000.png"))
+
+
+@pytest.mark.parametrize("in_place", [True, False])
+@pytest.mark.parametrize("edit, words", [
+    (darken, "checksum of the training images"), (double_the_focal_length, "checksum of the intrinsics"),
+    (remove_an_image, "number of test views 2 there and 1 here")])
+def test_eval_says_where_it_measures_another_scene(trained, scene, tmp_path, capsys, edit, words, in_place):
     run, other = str(tmp_path / "run"), str(tmp_path / "scene")
     shutil.copytree(trained, run)
     shutil.copytree(scene, other)
-    image = os.path.join(other, "images", "view_003.png")
-    Image.open(image).point(lambda value: value // 2).save(image)
-    assert main(["eval", run, "--scene", other]) == 0
+    if in_place:
+        edit_config(run, scene=other)
+        assert main(["eval", run]) == 0
+        assert "note" not in capsys.readouterr().out
+    before = results_of(run)
+    edit(other)
+    assert main(["eval", run] + ([] if in_place else ["--scene", other])) == 0
     said = capsys.readouterr().out
-    assert f"note: {other} is not the scene that {run} was trained on: checksum of the training images" in said
-    assert "test views" in said and results_of(run) == results_of(trained), "figures, which are not the run's"
+    assert f"note: {other} is not the scene that {run} was trained on: {words}" in said
+    assert "test views" in said and results_of(run) == before, "figures, which are not the run's"
+    assert ("warning: 1 of 9 images are missing" in said) == (edit is remove_an_image)
+
+
+def test_eval_says_where_the_scene_of_a_run_is_not_known(trained, scene, tmp_path, capsys):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
     os.remove(os.path.join(run, "checkpoint.pt"))
-    assert main(["eval", run, "--scene", scene]) == 0
+    assert main(["eval", run]) == 0
     assert f"note: whether {scene} is the scene that the run was trained on is not known" in capsys.readouterr().out
 
 

@@ -1,11 +1,13 @@
 """Scene folders, good and damaged: what is loaded, and which error names which file."""
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import math
 import os
+import pathlib
 import shutil
 
 import numpy as np
@@ -17,7 +19,9 @@ from scipy.spatial.transform import Rotation
 from diff_smoe_rasterization import io
 from dsmoe.config import TrainConfig
 from dsmoe.errors import SceneError
+from dsmoe.results.evaluation import Evaluation
 from dsmoe.results.pictures import file_names
+from dsmoe.results.rows import result_row
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.cameras import Camera
 from dsmoe.scenes.images import target_size
@@ -420,9 +424,67 @@ def test_no_folder_and_no_scene(tmp_path):
     refused(tmp_path / "model.ply", "model.ply: is a file; a scene is a folder")
 
 
-def test_a_missing_image(colmap_folder):
-    os.remove(os.path.join(colmap_folder, "images", "view_003.png"))
-    refused(colmap_folder, "view_003.png", "1 of 9 images are missing")
+@pytest.fixture(params=["colmap", "transforms", "nerf-synthetic"])
+def any_scene(request, colmap_folder, tmp_path):
+    """The tiny scene as one of the three kinds: its folder, and its images by name."""
+    if request.param != "colmap":
+        as_json(colmap_folder, request.param)
+    images = os.path.join(colmap_folder, "images")
+    return colmap_folder, {name: os.path.join(images, name) for name in sorted(os.listdir(images))}
+
+
+def as_json(folder, kind):
+    """Makes the tiny scene one of the kinds with json, of the same split."""
+    layout = read_layout(TrainConfig(scene=folder))
+    shutil.rmtree(os.path.join(folder, "sparse"))
+
+    def content(images):
+        frames = []
+        for image in images:
+            matrix = np.eye(4)
+            matrix[:3, :3] = image.camera.rotation.T @ np.diag([1.0, -1, -1])
+            matrix[:3, 3] = image.camera.center
+            frames.append({"file_path": f"images/{image.camera.name}", "transform_matrix": matrix.tolist()})
+        return {"fl_x": layout.train[0].camera.fx, "frames": frames}
+
+    files = {"transforms": [*layout.train, *layout.test]} if kind == "transforms" else {
+        "transforms_train": layout.train, "transforms_test": layout.test}
+    for name, images in files.items():
+        with open(os.path.join(folder, name + ".json"), "w", encoding="utf-8") as file:
+            json.dump(content(images), file)
+
+
+def test_a_missing_image_is_left_out_and_counted(any_scene, capsys):
+    folder, images = any_scene
+    before = load(folder)
+    os.remove(images["view_003.png"])
+    os.remove(images["view_008.png"])  # a test image
+    config = TrainConfig(scene=folder)
+    scene, layout = load(folder), read_layout(config)
+    assert [os.path.basename(view.camera.name) for view in scene.train] == [
+        f"view_{index:03d}.png" for index in (1, 2, 4, 5, 6, 7)], "no test image becomes a training image"
+    assert [os.path.basename(view.camera.name) for view in scene.test] == ["view_000.png"]
+    said = describe_scene(scene, layout, config).splitlines()[1]
+    assert said.startswith("warning: 2 of 9 images are missing and left out: ") and "view_003.png" in said
+    assert "view_008.png" in said and said.endswith("; --strict refuses such a scene")
+    for view in scene.train:
+        same, = (other for other in before.train if other.camera.name == view.camera.name)
+        assert (same.camera.rotation == view.camera.rotation).all() and same.camera.fx == view.camera.fx
+    assert len(load_cameras(config, "all")) == 7 and capsys.readouterr().err == said + "\n"
+    assert result_row(config, scene, 1, 0.0, Evaluation({}, None, []))["protocol"]["images_left_out"] == 2
+    refused(folder, "no such image", "2 of 9 images", "without --strict they are left out", strict=True)
+    for name in range(1, 8):
+        with contextlib.suppress(FileNotFoundError):
+            os.remove(images[f"view_{name:03d}.png"])
+    refused(folder, "no such image", "8 of 9 images")
+
+
+def test_a_folder_of_images_is_only_a_colmap_scenes(any_scene):
+    folder, _ = any_scene
+    if os.path.isdir(os.path.join(folder, "sparse")):
+        refused(folder, "images_4: no such folder", images="images_4")
+    else:
+        refused(folder, "--images is 'images_4', which is for a COLMAP scene", "json says", images="images_4")
 
 
 def test_a_missing_mask(colmap_folder):
@@ -448,10 +510,6 @@ def test_masks_that_do_not_fit(colmap_folder):
     with open(os.path.join(colmap_folder, "masks"), "w", encoding="utf-8") as file:
         file.write("not a folder")
     refused(colmap_folder, "masks", "is no folder")
-
-
-def test_a_missing_image_folder(colmap_folder):
-    refused(colmap_folder, "images_4", "no such folder", images="images_4")
 
 
 def test_an_unreadable_image(colmap_folder):
@@ -546,15 +604,40 @@ def test_a_focal_length_of_zero(colmap_folder):
     refused(colmap_folder, "cameras.txt", "camera 1", "focal length")
 
 
-def test_an_image_that_is_listed_twice(colmap_folder, nerf_folder):
+@pytest.mark.parametrize("again", ["same", "./", "../", "link", "hard link", "absolute"])
+def test_an_image_that_is_listed_twice(any_scene, again):
     """The second one, with a pose of its own, would be trained on too, or be a test image that was trained on."""
-    model = io.read_colmap(colmap_folder)
-    double = io.ColmapImage(99, "./view_003.png", 1, model.images[5].qvec, model.images[5].tvec)
-    for text in (True, False):
-        io.write_colmap(model.folder, io.ColmapModel(model.cameras, [*model.images, double], model.points), text=text)
-        refused(colmap_folder, "view_003.png is listed twice")
-    edit_json(nerf_folder / "transforms_train.json", lambda content: content["frames"].extend(content["frames"]))
-    refused(nerf_folder, "r_0.png is listed twice")
+    folder, images = any_scene
+    name, path = "view_003.png", images["view_003.png"]
+    if "link" in again:
+        (os.symlink if again == "link" else os.link)(path, os.path.join(folder, "images", "zzz.png"))
+    double = {"same": name, "./": f"./{name}", "../": f"../images/{name}", "absolute": path}.get(again, "zzz.png")
+    if os.path.isdir(os.path.join(folder, "sparse")):
+        model = io.read_colmap(folder)
+        pose = dataclasses.replace(model.images[5], id=99, name=double)
+        for text in (True, False):
+            io.write_colmap(model.folder, dataclasses.replace(model, images=[*model.images, pose]), text=text)
+            refused(folder, "is listed twice", "to train on or to test")
+        return
+    double = path if again == "absolute" else f"images/{double}"
+    for name in {*os.listdir(folder)} & {"transforms.json", "transforms_train.json"}:
+        edit_json(pathlib.Path(folder, name), lambda content: content["frames"].append(
+            {**content["frames"][5], "file_path": double}))
+    refused(folder, "is listed twice", "to train on or to test")
+
+
+def test_an_image_in_both_lists_of_transforms(transforms_folder):
+    names = [f"images/frame_{index:05d}.jpg" for index in range(10)]
+    edit_json(transforms_folder / "transforms.json", lambda content: content.update(
+        train_filenames=names[:8], test_filenames=["./" + name for name in names[7:]]))
+    refused(transforms_folder, "is listed twice", "to train on or to test")
+
+
+def test_both_files_of_a_nerf_scene_may_list_an_image_and_the_split_says_so(nerf_folder):
+    assert load(nerf_folder).split == "transforms_test.json lists the test images"
+    shutil.copy(nerf_folder / "transforms_train.json", nerf_folder / "transforms_test.json")
+    scene = load(nerf_folder)
+    assert scene.split == "transforms_test.json lists the test images, 1 of which are training images too"
 
 
 @pytest.mark.parametrize("large", [1e300, -2e9])
