@@ -13,6 +13,7 @@ from .scenes.pointcloud import PointCloud
 
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
 INITIAL_OPACITY = 0.1
+LARGEST_LOG = 88.7  # exp of more is infinite in float32
 MIN_SQUARED_DISTANCE = 1e-7  # of coinciding points, so that log scales stay finite
 
 PARAMETERS = ("means3D", "dc", "shs", "opacities", "scales", "rotations")
@@ -27,6 +28,17 @@ def inverse_sigmoid(x: torch.Tensor) -> torch.Tensor:
 def rotation_matrices(rotations: torch.Tensor) -> torch.Tensor:
     """[N, 3, 3] of quaternions (w, x, y, z) of any length [N, 4]."""
     return quaternion_to_matrix(torch.nn.functional.normalize(rotations))
+
+
+def are_numbers(name: str, values: torch.Tensor) -> torch.Tensor:
+    """Whether each value of a raw parameter can be used: finite, a log scale also by its exponential."""
+    return values < LARGEST_LOG if name == "scales" else values.isfinite()
+
+
+def finite_rows(raw: Dict[str, torch.Tensor]) -> torch.Tensor:
+    """[N] bool: the Gaussians that can be shown, all numbers of which can be used."""
+    rows = [are_numbers(name, tensor.detach()).flatten(1).all(1) for name, tensor in raw.items()]
+    return torch.stack(rows).all(0)
 
 
 class GaussianModel:

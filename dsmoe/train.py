@@ -34,6 +34,7 @@ from .system.output_folder import (
 from .system.progress import progress_bar
 from .training.checkpoint import damage_named, load_checkpoint, save_checkpoint
 from .training.forecast import Forecast
+from .training.state_check import Misfit, check_numbers
 from .training.strategy import Step, is_due
 from .training.trainer import Trainer
 
@@ -138,11 +139,22 @@ class Run:
         return row
 
     def save_checkpoint(self) -> None:
-        """Writes the state of trainer, history and losses."""
-        state = self.trainer.state_dict()
+        """Writes the state of trainer, history and losses. Raises TrainerError where that could not be gone on with."""
+        state = self._state()
         if self.trainer.leads:
             save_checkpoint(self._path(CHECKPOINT_NAME), {**state, "history": self.history, "losses": self.losses})
         self.trainer.meet()  # where one process ends before the file is whole, torchrun ends the others
+
+    def _state(self) -> Dict[str, Any]:
+        """The trainer's state. Raises TrainerError where a number in it is NaN or infinite."""
+        state = self.trainer.state_dict()
+        try:
+            if self.trainer.leads:
+                check_numbers(state)
+        except Misfit as error:
+            raise TrainerError(f"iteration {self.trainer.iteration}: the training has diverged, {error}; lower the "
+                               "learning rates") from error
+        return state
 
     def _show(self, bar: Any, loss: float) -> None:
         if not (self.progress or self.scalars.active):

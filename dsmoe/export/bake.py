@@ -11,7 +11,7 @@ from diff_smoe_rasterization.settings import resolve_background_gate
 
 from ..config import TrainConfig
 from ..errors import TrainerError
-from ..model import GaussianModel
+from ..model import GaussianModel, finite_rows
 from ..results.evaluation import evaluate
 from ..results.rendering import Renderer
 from ..results.rows import viewer_warning
@@ -75,7 +75,8 @@ class _Baking(Run):
         return "baking to alpha"
 
     def save_checkpoint(self) -> None:
-        pass
+        """Only looks whether one could be written."""
+        self._state()
 
     def _write_results(self) -> Dict[str, Any]:
         return {}
@@ -101,15 +102,16 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
         position_lr_init=math.sqrt(config.position_lr_init * config.position_lr_final),
         position_lr_final=config.position_lr_final)
     trainer = Trainer(config, load_scene(config, progress, checksums=False))
-    trainer.optimizer.replace_all(renderer.model.raw)
+    shown = finite_rows(renderer.model.raw)  # the rasterizer leaves out the others, and so do the formats
+    trainer.optimizer.replace_all({name: tensor.detach()[shown] for name, tensor in renderer.model.raw.items()})
     trainer.model.active_sh_degree = renderer.model.active_sh_degree
     strategy = RisingGate if _takes_gate(mode) else FixedGaussians
     trainer.strategy = strategy(trainer.strategy.context, squares)
     trained = _psnr(renderer, trainer)
-    shown = _psnr(_alpha(renderer, renderer.model), trainer)
+    by_viewers = _psnr(_alpha(renderer, renderer.model), trainer)
     _Baking(trainer, progress).train()
     result = _alpha(renderer, trainer.model)
-    return Baked(result, trained, shown, _psnr(result, trainer))
+    return Baked(result, trained, by_viewers, _psnr(result, trainer))
 
 
 def _takes_gate(mode: str) -> bool:

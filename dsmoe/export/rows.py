@@ -8,7 +8,8 @@ import numpy as np
 
 from diff_smoe_rasterization.io import Gaussians
 
-from ..results.modelfile import finite_gaussians
+from ..model import finite_rows as are_finite
+from ..results.modelfile import raw_of
 
 # What half a turn about x makes of x, y, z, and of the real spherical harmonics of degrees 1 to 3 (y, z, x; xy, ...).
 TURNED_AXES = np.array([1, -1, -1], np.float32)
@@ -26,7 +27,7 @@ def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
     [M, 3 (K - 1)] of the M Gaussians all of whose numbers are finite."""
     arrays = [gaussians.means3D, gaussians.opacity_logits, gaussians.log_scales, gaussians.rotations,
               gaussians.dc[:, 0], gaussians.shs.reshape(len(gaussians.shs), 3 * gaussians.shs.shape[1])]
-    finite = finite_gaussians(gaussians)
+    finite = are_finite(raw_of(gaussians)).numpy()
     return [array[finite] for array in arrays]
 
 

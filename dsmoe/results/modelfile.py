@@ -2,9 +2,8 @@
 from __future__ import annotations
 
 import os
-from typing import NamedTuple, Optional, Tuple
+from typing import Dict, NamedTuple, Optional, Tuple
 
-import numpy as np
 import torch
 
 from diff_smoe_rasterization import io
@@ -18,10 +17,9 @@ from diff_smoe_rasterization.settings import (
 )
 
 from ..errors import TrainerError
-from ..model import GaussianModel
+from ..model import GaussianModel, finite_rows
 from ..system.files import is_file, new_file
 
-LARGEST_LOG = 88.7  # exp of more is infinite in float32
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
 
 
@@ -69,13 +67,10 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     except ValueError as error:
         other = "; it is no model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
         raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
-    arrays = {"means3D": stored.means3D, "dc": stored.dc, "shs": stored.shs, "opacities": stored.opacity_logits,
-              "scales": stored.log_scales, "rotations": stored.rotations}
-    shown = finite_gaussians(stored)
-    if len(shown) and not shown.any():
-        raise TrainerError(f"{path}: each of its {len(shown):,} Gaussians has a number that is NaN or infinite, so the "
-                           "rasterizer shows none; was the training diverging?")
-    raw = {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
+    raw = raw_of(stored, device)
+    if len(stored.means3D) and not finite_rows(raw).any():
+        raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
+                           "infinite, so the rasterizer shows none; was the training diverging?")
     model = GaussianModel(raw, stored.sh_degree)
     model.active_sh_degree = stored.sh_degree
     record = stored.blend_mode
@@ -83,11 +78,11 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     return model, Recorded(mode, stored.background_gate, said_of_record(record))
 
 
-def finite_gaussians(gaussians: io.Gaussians) -> np.ndarray:
-    """[N] bool: which Gaussians have finite numbers, their scales included. Others cannot be shown."""
-    g = gaussians
-    arrays = (g.means3D, g.dc, g.shs, g.opacity_logits, g.rotations, np.where(g.log_scales < LARGEST_LOG, 0, np.nan))
-    return np.all([np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in arrays], axis=0)
+def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:
+    """The raw parameters in a file, float32."""
+    arrays = {"means3D": gaussians.means3D, "dc": gaussians.dc, "shs": gaussians.shs,
+              "opacities": gaussians.opacity_logits, "scales": gaussians.log_scales, "rotations": gaussians.rotations}
+    return {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:

@@ -61,4 +61,5 @@ class LearnedGate:
         """Takes what `state_dict` gave."""
         self.logarithm.copy_(state["logarithm"])
         self._evaluate()
-        self._adam = dict(state["adam"])
+        self._adam = {name: value.to(self.value.device, copy=True) if isinstance(value, torch.Tensor) else value
+                      for name, value in state["adam"].items()}

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import re
 import signal
@@ -12,6 +13,7 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.images import as_float
 from diff_smoe_rasterization.losses import fused_ssim, l1_ssim_loss
 from dsmoe.cli import main
+from dsmoe.errors import TrainerError
 from dsmoe.export.bake import RisingGate, bake
 from dsmoe.inspection import open_renderer
 from dsmoe.results.evaluation import evaluate
@@ -71,6 +73,23 @@ def test_a_baked_model_is_better_in_alpha_than_what_viewers_show(smoe_run, tmp_p
     for ply, mode, expected in ((path, "alpha", baked), (model_path(smoe_run.output, 250), "smoe", trained)):
         renderer = open_renderer(smoe_run, ply, mode, "cpu")
         assert evaluate(renderer, views, "cpu", passes=1).metrics["psnr"] == pytest.approx(expected, abs=0.0051)
+
+
+def test_gaussians_that_cannot_be_shown_are_left_out_and_a_diverging_baking_is_told(smoe_run, monkeypatch):
+    renderer = open_renderer(smoe_run, model_path(smoe_run.output, 250), "smoe", "cpu")
+    renderer.model.raw["scales"].data[3, 0] = 100.0  # whose exponential is infinite
+    count = renderer.model.num_gaussians
+    assert bake(smoe_run, renderer, 2, progress=False).renderer.model.num_gaussians == count - 1
+    step = Trainer.step
+
+    def diverging_step(self, *arguments):
+        done = step(self, *arguments)
+        self.model.raw["dc"].data[0] = math.nan
+        return done
+
+    monkeypatch.setattr(Trainer, "step", diverging_step)
+    with pytest.raises(TrainerError, match="iteration 2: the training has diverged, its `raw/dc` is NaN"):
+        bake(smoe_run, renderer, 2, progress=False)
 
 
 def l2_ssim_loss(image, target, weight, squares):

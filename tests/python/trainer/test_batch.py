@@ -13,6 +13,7 @@ from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
 from dsmoe.train import train
+from dsmoe.training.background_gate import LearnedGate
 from dsmoe.training.trainer import Trainer
 
 
@@ -128,6 +129,22 @@ def test_a_batched_run_resumes_bit_for_bit(tiny_config, tmp_path, gate):
             contents.append(file.read())
     assert contents[0] == contents[1] and resumed["psnr"] == row["psnr"]
     assert row["num_gaussians"] != row["protocol"]["init_points"] and row["protocol"]["batch"] == 4
+
+
+def test_a_gate_is_resumed_on_its_own_device(tiny_config):
+    """A batch's checkpoint is read to the host. The device "meta" stands for a GPU: it has no numbers, but a place."""
+    trained = LearnedGate(tiny_config, "cpu")
+    trained.step()
+    resumed = LearnedGate(tiny_config, "meta")
+    state = trained.state_dict()
+    resumed.load_state_dict(state)
+    tensors = {name: value for name, value in resumed.state_dict()["adam"].items() if isinstance(value, torch.Tensor)}
+    assert {*tensors} == {"exp_avg", "exp_avg_sq"} and {tensor.device.type for tensor in tensors.values()} == {"meta"}
+    again = LearnedGate(tiny_config, "cpu")
+    again.load_state_dict(state)
+    again.gradient.fill_(3.0)
+    again.step()
+    assert not state["adam"]["exp_avg"].any(), "the state that it was given stays"
 
 
 def test_training_lowers_the_loss(tiny_config, scene):

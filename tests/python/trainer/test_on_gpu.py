@@ -11,7 +11,7 @@ import torch
 from devices import without_cuda_because
 
 from dsmoe.cli import main
-from dsmoe.distributed.trainer import BatchTrainer
+from dsmoe.distributed.trainer import BatchTrainer, new_trainer
 from dsmoe.model import PARAMETERS
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
@@ -96,20 +96,23 @@ def test_a_run_with_few_points_and_other_options(config):
     assert row["protocol"]["init_points"] == 20 and row["num_gaussians"] > 0 and math.isfinite(row["psnr"])
 
 
-def test_a_resumed_run_goes_on_where_it_stopped(config, scene):
-    config = dataclasses.replace(config, checkpoint_every=15)
-    run = Run(Trainer(config, scene), progress=False)
+@pytest.mark.parametrize("batch", [1, 5])
+def test_a_resumed_run_goes_on_where_it_stopped(config, scene, batch):
+    config = config.changed(checkpoint_every=15, batch=batch)
+    run = Run(new_trainer(config, scene), progress=False)
     os.makedirs(config.output, exist_ok=True)
-    for _ in range(15):
+    for _ in range(15 // batch):
         run.trainer.step()
     run.save_checkpoint()
-    twin = Run(Trainer(config, scene), progress=False)
+    twin = Run(new_trainer(config, scene), progress=False)
     assert twin.resume() and twin.trainer.iteration == 15
     for name in PARAMETERS:
         mine, theirs = run.trainer.model.raw[name], twin.trainer.model.raw[name]
         assert theirs.device.type == "cuda" and torch.equal(mine, theirs)
         assert torch.equal(run.trainer.optimizer.adam.state[mine]["exp_avg"],
                            twin.trainer.optimizer.adam.state[theirs]["exp_avg"])
+    for mine, theirs in zip(run.trainer.gate._adam.values(), twin.trainer.gate._adam.values()):
+        assert mine == theirs and torch.as_tensor(mine).device == torch.as_tensor(theirs).device
     assert twin.trainer.order.state_dict() == run.trainer.order.state_dict()
     assert math.isfinite(twin.train()["psnr"]) and twin.trainer.iteration == config.iterations
 

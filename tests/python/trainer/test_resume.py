@@ -20,7 +20,7 @@ from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system import files
 from dsmoe.train import train
-from dsmoe.training import checkpoint
+from dsmoe.training import checkpoint, state_check
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
 from dsmoe.training.order import ViewOrder
 from dsmoe.training.trainer import Trainer
@@ -437,6 +437,72 @@ def test_a_damaged_checkpoint_is_named(tiny_config, tmp_path, monkeypatch):
         train(tiny_config, resume=True, progress=False)
 
 
+def test_no_number_of_a_checkpoint_is_gone_on_with_that_no_training_has(tiny_config):
+    """Each tensor that a step changes, for each strategy: NaN, infinities, and memory that a step cannot write into."""
+    for options in ({"strategy": "3dgs"}, {"strategy": "importance", "budget": 60, "blend_mode": "smoe_eq7"},
+                    {"strategy": "mcmc", "budget": 160}):
+        config = tiny_config.changed(iterations=38, output=f"{tiny_config.output}_{options['strategy']}", **options)
+        train(config, progress=False)
+        path = os.path.join(config.output, "checkpoint.pt")
+        state = load_checkpoint(path, "cpu")
+        run = runs.Run(Trainer(config, load_scene(config, progress=False)), progress=False)
+        assert run.resume()
+        tensors = dict(state_check._tensors(state, state_check.CHANGING))
+        assert len(tensors) > 6 * 3 and "gate/adam/exp_avg" in tensors
+        for place, tensor in tensors.items():
+            wrong = {"NaN": float("nan"), "infinity": float("inf")}
+            if place.endswith("_sq"):
+                wrong["negative"] = -1e-12
+            if place == "raw/scales":
+                wrong["overflows as a scale"] = 1e30
+            alterations = {name: last_is(tensor, value) for name, value in wrong.items()}
+            if len(tensor) > 1:
+                alterations["strides"] = torch.stack([tensor, tensor], -1)[..., 0]
+                alterations["expanded"] = tensor[:1].expand_as(tensor)
+            for name, value in alterations.items():
+                with pytest.raises(state_check.Misfit, match=f"its `{place}` is .*; it must be "):
+                    run.trainer.check_state(altered(state, place, value))
+                    pytest.fail(f"{place}: {name}")
+    both = altered(state, "optimizer/dc/exp_avg_sq", state["optimizer"]["dc"]["exp_avg"].abs_())
+    save_checkpoint(path, both)
+    with pytest.raises(TrainerError, match="`tensors` is in the same memory; it must be apart"):
+        run.resume()
+
+
+def last_is(tensor, value):
+    """A copy whose last element has another value."""
+    copy = tensor.clone()
+    copy.view(-1)[-1] = value
+    return copy
+
+
+@pytest.mark.parametrize("checkpoint_every", [10, 0])
+@pytest.mark.parametrize("name, value, words", [
+    ("means3D", float("nan"), "`raw/means3D` is NaN, infinite or out of range in 1 of"),
+    ("scales", 100.0, "`raw/scales` is .*; it must be below 88.7")])
+def test_a_training_that_diverges_in_its_parameters_ends_with_an_error(tiny_config, monkeypatch, name, value, words,
+                                                                        checkpoint_every):
+    """The rasterizer leaves out such a Gaussian, so the loss says nothing. The last good checkpoint stays."""
+    step = Trainer.step
+
+    def diverging_step(self, *arguments):
+        done = step(self, *arguments)
+        if self.iteration == 13:
+            with torch.no_grad():
+                self.model.raw[name][0, 0] = value
+        return done
+
+    monkeypatch.setattr(Trainer, "step", diverging_step)
+    config = tiny_config.changed(checkpoint_every=checkpoint_every, iterations=20, densify_until_iter=0)
+    with pytest.raises(TrainerError, match=f"iteration 20: the training has diverged, its {words}.*; lower the"):
+        train(config, progress=False)
+    assert not os.path.exists(os.path.join(config.output, "point_cloud"))
+    checkpoint = os.path.join(config.output, "checkpoint.pt")
+    assert os.path.exists(checkpoint) == bool(checkpoint_every)
+    if checkpoint_every:
+        assert load_checkpoint(checkpoint, "cpu")["iteration"] == 10
+
+
 def altered(state, path, value):
     """A copy of nested dictionaries and lists with another value, or value(the old one), at a/b/0."""
     name, _, rest = path.partition("/")
@@ -457,13 +523,18 @@ ALTERATIONS = [
     ("raw", lambda raw: {name: rows[:0] for name, rows in raw.items()}),
     ("raw", lambda raw: {name: rows for name, rows in raw.items() if name != "dc"}), ("raw/more", torch.ones(3)),
     ("optimizer/more", {}), ("optimizer/dc", {}), ("optimizer/dc/step", -1), ("optimizer/dc/step", float("nan")),
-    ("optimizer/dc/step", "many"), ("optimizer/dc/exp_avg", lambda rows: rows[1:]), ("optimizer", [1]),
+    ("optimizer/dc/step", "many"), ("optimizer/dc/step", "1"), ("optimizer/dc/step", 1.0), ("optimizer/dc/step", 3),
+    ("optimizer/dc/exp_avg", lambda rows: rows[1:]), ("optimizer", [1]),
     ("optimizer/scales/exp_avg_sq", lambda rows: rows.half()), ("optimizer/scales/exp_avg_sq", 1.0),
     ("strategy", {}), ("strategy/more", 1), ("strategy/view_count", lambda rows: rows[1:]),
-    ("strategy/gradient_sum", lambda rows: rows.int()), ("strategy/gradient_sum", None), ("strategy", None),
+    ("strategy/gradient_sum", lambda rows: torch.stack([rows, rows], -1)[..., 0]),
+    ("optimizer/dc/exp_avg", lambda rows: rows[:1].expand_as(rows)), ("strategy/gradient_sum", lambda rows: rows.int()),
+    ("strategy/gradient_sum", None), ("strategy", None),
     ("gate", None), ("gate/logarithm", torch.ones(2)), ("gate/logarithm", 1.0),
     ("gate/logarithm", torch.full((1,), float("nan"))), ("gate/logarithm", torch.full((1,), 1e3)),
-    ("gate/adam/exp_avg", torch.ones(2)),
+    ("gate/adam/exp_avg", torch.ones(2)), ("gate/adam/exp_avg", [0.0]), ("gate/adam/step", "1"),
+    ("gate/adam/step", True), ("gate/adam/exp_avg_sq", torch.full((1,), -1.0)), ("gate/adam/more", 1),
+    ("gate/logarithm", torch.full((1,), -1e3)),
     ("order/left", [0, 0]), ("order/left", [7]), ("order/left", [-1]), ("order/left", ["0"]), ("order/left", None),
     ("order/random/1", lambda numbers: numbers[1:]), ("order/random/1/624", 10**6), ("order/random/2", "1"),
     ("random/python/1/0", -1), ("random/python/0", 9), ("random/numpy/0", "other"), ("random/numpy/1", [1, 2]),
