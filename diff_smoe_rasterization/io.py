@@ -31,9 +31,7 @@ class Gaussians:
     opacity_logits: np.ndarray  # [N, 1]; opacity = sigmoid
     log_scales: np.ndarray  # [N, 3]; scale = exp
     rotations: np.ndarray  # [N, 4] (w, x, y, z), not normalised
-    # The mode that the model was trained with, under its name in files: see `settings.record_of`, `mode_of_record`.
-    # None where the file does not say.
-    blend_mode: Optional[str] = None
+    blend_mode: Optional[str] = None  # that the model was trained with; None where the file does not say
     background_gate: Optional[float] = None  # lambda of `smoe` and `smoe_eq7`, from the .ply's comments
     comments: Tuple[str, ...] = ()  # comment lines of the file, those that record mode and gate included
 

@@ -43,9 +43,6 @@ _FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_eq7": None, "smoe_tn": 0.0, "s
 GATED_MODES = tuple(mode for mode, gate in _FIXED_GATES.items() if gate is None)
 """The blend modes that take a `background_gate`: `smoe` and `smoe_eq7`."""
 
-_RECORDED = {"smoe": "smoe_tails"}
-"""What files call a blend mode where it is not its name: `smoe` in a file is the rule of version 0.1, `smoe_eq7`."""
-
 _FAINT_BELOW = {"smoe": 0.9}
 """The `faint_below` of a blend mode where the caller gives none; of the others it is 2: no pair is left out."""
 
@@ -148,32 +145,6 @@ OUTPUTS = ("alpha", *FEATURE_OUTPUTS)
 """The optional outputs of `rasterize`, in the order of `Rendering`."""
 
 
-def record_of(blend_mode: str) -> str:
-    """Returns the name under which files record a blend mode."""
-    return _RECORDED.get(blend_mode, blend_mode)
-
-
-def mode_of_record(record: str) -> str:
-    """Returns the blend mode that a file records; a name that is none as it is."""
-    if record in _RECORDED:
-        return f"{record}_eq7"
-    return next((mode for mode, name in _RECORDED.items() if name == record), record)
-
-
-def said_of_record(record: Optional[str]) -> str:
-    """Returns what to tell a user of a file that records a blend mode so; empty where the name says it all."""
-    if record not in _RECORDED:
-        return ""
-    return (f"it records the blend mode {record} of an earlier version, which is {mode_of_record(record)} now; the new "
-            f"{record} has another rule, and files record it as {record_of(record)}")
-
-
-def said_of_name_in_files(name: str) -> str:
-    """Returns what to give instead of a name that only files use, as a part of an error; empty for other names."""
-    mode = mode_of_record(name)
-    return f"{mode}, which files call {name}" if name not in BLEND_MODES and mode in BLEND_MODES else ""
-
-
 def resolve_blend_mode(blend_mode: Optional[str]) -> str:
     """Returns the blend mode that a rendering uses.
 
@@ -186,8 +157,7 @@ def resolve_blend_mode(blend_mode: Optional[str]) -> str:
         blend_mode = os.environ.get(BLEND_MODE_VARIABLE) or "alpha"
         source = BLEND_MODE_VARIABLE
     if blend_mode not in BLEND_MODES:
-        raise ValueError(f"{source} is {blend_mode!r}; it must be " + (
-            said_of_name_in_files(blend_mode) or f"one of {', '.join(BLEND_MODES)}"))
+        raise ValueError(f"{source} is {blend_mode!r}; it must be one of {', '.join(BLEND_MODES)}")
     return blend_mode
 
 

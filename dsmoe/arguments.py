@@ -11,7 +11,7 @@ from . import choices
 from .bench.names import SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
 from .config import DEVICES, PRINCIPAL_POINTS
-from .config_arguments import add_arguments, blend_mode_typed
+from .config_arguments import add_arguments
 from .patches import TRAINERS
 
 TRAIN_EXAMPLES = """examples:
@@ -141,7 +141,7 @@ def build_parser() -> argparse.ArgumentParser:
                               usage="dsmoe run --blend-mode MODE [--background-gate V] [--trainer NAME] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", "--blend_mode", type=blend_mode_typed, choices=BLEND_MODES, required=True,
+    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--background-gate", "--background_gate", type=float, metavar="V",
                      help="in smoe, how much the background weighs; 0 is the paper's Eq. 7 (default: "
@@ -176,7 +176,7 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
     parser.add_argument("--scene", help="folder " + scene)
-    parser.add_argument("--blend-mode", type=blend_mode_typed, choices=BLEND_MODES,
+    parser.add_argument("--blend-mode", choices=BLEND_MODES,
                         help="needed for a .ply that does not record it; must agree where it does")
     parser.add_argument("--background-gate", type=float, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")

@@ -13,8 +13,6 @@ from diff_smoe_rasterization.settings import (
     BLEND_MODES,
     GATED_MODES,
     MAX_BACKGROUND_GATE,
-    mode_of_record,
-    record_of,
     resolve_background_gate,
     resolve_blend_mode,
 )
@@ -96,7 +94,7 @@ class TrainConfig:
         None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
               "prune; importance: grow beyond the budget, remove what changes the images least, move the rest to where "
               "the error is; mcmc: relocation and noise (default: importance with --budget, else 3dgs)",
-        choices=STRATEGY_NAMES, flags=("--strategy", "--schedule"))
+        choices=STRATEGY_NAMES)
     strategy_options: str = _option("", "settings of `importance`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
     device: str = _option("cpu", "where to train; auto: $DSMOE_DEVICE, else the GPU if it can be used",
@@ -255,16 +253,16 @@ class TrainConfig:
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
 
     def record(self) -> Dict[str, Any]:
-        """The options as files hold them: what `of_record` reads."""
-        return {**dataclasses.asdict(self), "blend_mode": record_of(str(self.blend_mode))}
+        """The options as files hold them."""
+        return dataclasses.asdict(self)
 
     @classmethod
     def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
-        """The options of an earlier run; one that names no background gate was trained with 0."""
-        values = of_today(values)
-        mode, gate = mode_of_record(values["blend_mode"]), values.get("background_gate")
-        return cls(**{**values, "blend_mode": mode,
-                      "background_gate": 0.0 if gate is None and mode in GATED_MODES else gate})
+        """The options that `record` gave. Raises ValueError where one is missing: a default would be another run."""
+        missing = sorted({option.name for option in dataclasses.fields(cls)} - {*values})
+        if missing:
+            raise ValueError(f"the option {', '.join(missing)} is missing")
+        return cls(**values)
 
     @classmethod
     def load(cls, folder: str) -> TrainConfig:
@@ -286,17 +284,17 @@ class TrainConfig:
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a json object of options")
         known = {option.name for option in dataclasses.fields(cls)}
-        unknown = sorted(set(of_today(values)) - known)
+        unknown = sorted(set(values) - known)
         if unknown:
             raise ConfigError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
         # Rendering must use the mode of the training, so an absent mode is never replaced by a default.
-        if mode_of_record(str(values.get("blend_mode"))) not in BLEND_MODES:
+        if values.get("blend_mode") not in BLEND_MODES:
             raise ConfigError(f"{path}: blend_mode is {values.get('blend_mode')!r}; "
                              f"it must be one of {', '.join(BLEND_MODES)}")
         values["output"] = folder  # the folder may have been moved
         try:
             return cls.of_record(values).validate()
-        except (TypeError, OverflowError, ConfigError) as error:
+        except (TypeError, ValueError, OverflowError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from error
 
     @classmethod
@@ -339,16 +337,6 @@ class TrainConfig:
         if differences:
             raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `--resume -o "
                               f"{self.output}` alone keeps the run's options; more --iterations extend it")
-
-
-def of_today(record: Dict[str, Any]) -> Dict[str, Any]:
-    """Options or a row by today's names. Earlier versions called `strategy` `schedule`, and `importance` `gate`."""
-    def renamed(values: Dict[str, Any]) -> Dict[str, Any]:
-        return {"strategy" if name == "schedule" else name:
-                "importance" if (name, value) == ("schedule", "gate") else value for name, value in values.items()}
-
-    protocol = record.get("protocol")
-    return renamed({**record, "protocol": renamed(protocol)} if isinstance(protocol, dict) else record)
 
 
 def _recipe_of(strategy: str) -> Dict[str, Any]:

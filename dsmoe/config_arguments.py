@@ -5,7 +5,7 @@ import argparse
 import dataclasses
 from typing import Any, Dict, Optional, Sequence, Union
 
-from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, said_of_name_in_files
+from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES
 
 from .config import LEARNED, TrainConfig, flags_of, learned_gate_of
 from .errors import ConfigError
@@ -26,13 +26,6 @@ def _number_or_learned(text: str) -> Union[float, str]:
         return text if text == LEARNED else float(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
-
-
-def blend_mode_typed(text: str) -> str:
-    """What --blend-mode takes: `choices` refuses what is no blend mode, this says more of names that files use."""
-    if said_of_name_in_files(text):
-        raise argparse.ArgumentTypeError(f"is {text!r}; it must be {said_of_name_in_files(text)}")
-    return text
 
 
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
@@ -58,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         if option.type == "bool":
             group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue
-        kind = blend_mode_typed if option.name == "blend_mode" else _TYPES[str(option.type)]
+        kind = _TYPES[str(option.type)]
         keywords: Dict[str, Any] = {"type": kind, "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True

@@ -2,14 +2,11 @@
 from __future__ import annotations
 
 import os
-import sys
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from PIL import Image
-
-from diff_smoe_rasterization.settings import mode_of_record
 
 from .config import CHECKPOINT_NAME, LEARNED, TrainConfig
 from .errors import TrainerError
@@ -45,7 +42,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     config = TrainConfig.of_run(output, "--scene", device=device, **options)
     check_device(device)
     ply = trained_model_path(output, config.iterations)
-    earlier = [row for row in read_results(output) if _is_of(row, config)]
+    earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     layout = read_layout(config)
     scene = load_scene(config, progress, layout).to(device)
     note, is_other = _compared(scene, config)
@@ -82,8 +79,6 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
     model, recorded = load_model(ply, device)
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
     gate = agreed_background_gate(ply, mode, recorded, asked_gate)
-    if recorded.note:
-        print(f"note: {ply}: {recorded.note}", file=sys.stderr)
     return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
                     background_gate=gate)
 
@@ -115,12 +110,6 @@ def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
         return "", False
     return (f"note: {config.scene} is not the scene that {config.output} was trained on: {difference} here; "
             f"{RESULTS_NAME} stays"), True
-
-
-def _is_of(row: Dict[str, Any], config: TrainConfig) -> bool:
-    """Whether a row is of the run's blend mode, whichever version wrote both."""
-    mode = row.get("blend_mode")
-    return config.blend_mode in (mode, mode_of_record(str(mode)))
 
 
 def _gate_of(config: TrainConfig) -> Optional[float]:

@@ -6,7 +6,6 @@ import torch
 from PIL import Image
 
 from diff_smoe_rasterization import io, rasterize, settings_from_camera
-from diff_smoe_rasterization.settings import mode_of_record
 
 
 def load(path):
@@ -19,7 +18,7 @@ def load(path):
         "rotations": torch.nn.functional.normalize(torch.tensor(stored.rotations)),
         "shs": torch.tensor(np.concatenate([stored.dc, stored.shs], axis=1)),
     }
-    blend = {"blend_mode": mode_of_record(stored.blend_mode or "alpha"), "background_gate": stored.background_gate}
+    blend = {"blend_mode": stored.blend_mode or "alpha", "background_gate": stored.background_gate}
     return arguments, {**blend, "sh_degree": stored.sh_degree}
 
 

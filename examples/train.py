@@ -9,7 +9,6 @@ import torch
 
 from diff_smoe_rasterization import FusedAdam, distCUDA2, io, rasterize
 from diff_smoe_rasterization.losses import l1_ssim_loss
-from diff_smoe_rasterization.settings import record_of
 from dsmoe.config import TrainConfig
 from dsmoe.scenes.scene import load_scene
 from dsmoe.scenes.synthetic import write_synthetic_scene
@@ -55,5 +54,5 @@ for step in range(arguments.iterations):
 arrays = {name: tensor.detach().numpy() for name, tensor in raw.items()}
 io.write_gaussians(arguments.output, io.Gaussians(
     arrays["means3D"], arrays["dc"], arrays["dc"][:, :0], arrays["opacities"], arrays["scales"], arrays["rotations"],
-    blend_mode=record_of(arguments.blend_mode), background_gate=gate))
+    blend_mode=arguments.blend_mode, background_gate=gate))
 print(f"{arguments.output}: {count} Gaussians")

@@ -17,10 +17,7 @@ from diff_smoe_rasterization.settings import (
     BLEND_MODE_VARIABLE,
     BLEND_MODES,
     GATED_MODES,
-    mode_of_record,
-    record_of,
     resolve_blend_mode,
-    said_of_record,
 )
 
 SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
@@ -43,19 +40,19 @@ def default_smoe() -> Tuple[str, str]:
     return (mode if os.environ.get(BLEND_MODE_VARIABLE) else "smoe"), gate
 
 
-def smoe_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
+def smoe_of(dataset: Any) -> Dict[str, Any]:
     """Returns what `blend_of` does for the trainer of the paper's authors, whose rasterizer is one of `smoe`.
 
     In `smoe` tails count in every pixel, as in their program. A model without a recorded mode is of that program.
     """
-    blend = blend_of(dataset, of_saved, unrecorded="smoe")
+    blend = blend_of(dataset, unrecorded="smoe")
     return {**blend, "faint_below": FAINT_EVERYWHERE} if blend["blend_mode"] == "smoe" else blend
 
 
 def saved_smoe_of(dataset: Any) -> Dict[str, Any]:
     """Returns what `smoe_of` does, for a function that renders a trained model, as `saved_blend_of`."""
     _take_saved(dataset)
-    return smoe_of(dataset, of_saved=True)
+    return smoe_of(dataset)
 
 
 def saved_blend_of(dataset: Any) -> Dict[str, Any]:
@@ -64,7 +61,7 @@ def saved_blend_of(dataset: Any) -> Dict[str, Any]:
     What is not typed as an option is what the model's cfg_args records, whatever default `dataset` brought.
     """
     _take_saved(dataset)
-    return blend_of(dataset, of_saved=True)
+    return blend_of(dataset)
 
 
 def _take_saved(dataset: Any) -> None:
@@ -75,13 +72,12 @@ def _take_saved(dataset: Any) -> None:
             setattr(dataset, option, saved.get(option))
 
 
-def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") -> Dict[str, Any]:
+def blend_of(dataset: Any, unrecorded: str = "alpha") -> Dict[str, Any]:
     """Returns the settings `blend_mode` and `background_gate` of a run (None but in GATED_MODES).
 
-    Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args; there `smoe` is
-    `smoe_tails`. Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a
-    `background_gate`: 0. `smoe` in the cfg_args of an earlier version is `smoe_eq7`, even if `smoe` is also typed:
-    where `dataset` has a trained model's options, so its gate is no text, and under `of_saved`.
+    Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args.
+    Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a
+    `background_gate`: 0.
     From then on a rendering of this process whose settings name no mode has both.
     Says on stderr what they are. Warns, once, where one may not be what was meant.
     Raises ValueError where one is wrong, RuntimeError where the renderer has another rasterizer.
@@ -97,11 +93,6 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")
         mode = unrecorded
-    if mode == saved.get("blend_mode") and said_of_record(mode) and (of_saved or not isinstance(gate, str)):
-        say(f"{dataset.model_path}/cfg_args: {said_of_record(mode)}")
-        mode = mode_of_record(mode)
-    elif mode not in BLEND_MODES:
-        mode = mode_of_record(mode)
     if mode not in BLEND_MODES:
         raise ValueError(f"the blend mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)}")
     if mode in GATED_MODES and gate is None:
@@ -114,12 +105,11 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
     # Rendering without an option never warns: it has what cfg_args records.
     for option, value in zip(OPTIONS, (mode, gate)):
         before = saved.get(option)
-        before = mode_of_record(before) if isinstance(before, str) else before
         if value is not None and before not in (None, value):
             _warn(f"{dataset.model_path}/cfg_args is of a run with {option} {before}, but this one has {value}; a "
                   f"training overwrites it. To go on as before, give --{option} {before}")
     settings.blend_of_process = mode, gate  # the patch's line in the renderer may be deleted
-    dataset.blend_mode, dataset.background_gate = record_of(mode), gate
+    dataset.blend_mode, dataset.background_gate = mode, gate
     return {"blend_mode": mode, "background_gate": gate}
 
 

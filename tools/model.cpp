@@ -91,7 +91,7 @@ BlendRules<double> choose_blend(const io::GaussianModel& model, const std::strin
                                 std::optional<double> background_gate) {
   const bool is_splat = file_extension(file) == ".splat";  // which viewers blend by alpha
   const std::string record = is_splat ? "alpha" : model.blend_mode;
-  const std::optional<BlendMode> recorded = blend_mode_of_record(record);
+  const std::optional<BlendMode> recorded = blend_mode_of(record);
   if (mode.empty() && record.empty()) {
     throw UsageError(file +
                      " does not say which blend it was trained with (no `comment blend_mode`); pass --blend, "
@@ -103,14 +103,9 @@ BlendRules<double> choose_blend(const io::GaussianModel& model, const std::strin
   }
   BlendRules<double> choice;
   choice.mode = *chosen;
-  const std::string name = recorded ? blend_names()[static_cast<std::size_t>(*recorded)] : io::printable(record);
-  if (recorded && record != name && record != record_of(*recorded)) {
-    std::fprintf(stderr, "note: %s records the blend %s of an earlier version, which is %s now\n", file.c_str(),
-                 record.c_str(), name.c_str());
-  }
   if (!record.empty() && chosen != recorded) {
     std::fprintf(stderr, "note: %s %s the blend %s; in another one Gaussians show another scene\n", file.c_str(),
-                 is_splat ? "does not say its blend; viewers take it for" : "was trained with", name.c_str());
+                 is_splat ? "does not say its blend; viewers take it for" : "was trained with", io::printable(record).c_str());
   }
   if (choice.mode != BlendMode::kSmoe && choice.mode != BlendMode::kSmoeEq7) {
     if (background_gate) throw UsageError("--background-gate is for --blend smoe and smoe_eq7 only");

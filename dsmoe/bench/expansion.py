@@ -291,16 +291,14 @@ def _gated(blend_mode: str, gate: Any, *rest: Any) -> Tuple[Any, ...]:
 def cell_id(cell: Values) -> str:
     """A readable name, and a checksum of everything that decides the figures: another protocol is another cell."""
     blend = blend_of(cell)
-    # Names stay as earlier versions made them, so that earlier rows are found.
-    strategy = "gate" if cell["strategy"] == "importance" else cell["strategy"]
-    named = ("densify_grad_threshold", "budget", "seed", "protocol")
-    identity = {**{key: cell[key] for key in named if key in cell}, "blend_mode": blend, "schedule": strategy}
+    named = ("strategy", "densify_grad_threshold", "budget", "seed", "protocol")
+    identity = {**{key: cell[key] for key in named if key in cell}, "blend_mode": blend}
     for key in ("method", "scene"):
         identity[key] = {name: value for name, value in cell[key].items() if name not in NOT_IN_THE_IDENTITY}
     checksum = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
     threshold = re.sub(r"\.?0+$", "", f"{cell['densify_grad_threshold']:.7f}")
     return "_".join([cell["method"]["label"], cell["scene"]["name"], blend.replace(" ", "-"),
-                     strategy or "own", threshold, *([f"n{cell['budget']}"] if "budget" in cell else []),
+                     cell["strategy"] or "own", threshold, *([f"n{cell['budget']}"] if "budget" in cell else []),
                      f"s{cell['seed']}", checksum])
 
 

@@ -9,7 +9,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 from typing_extensions import Annotated
 
-from ..config import LEARNED, of_today
+from ..config import LEARNED
 from .errors import BenchError
 from .names import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 from .schema import first_mistake, must
@@ -46,7 +46,7 @@ Lpips = create_model("Lpips", __base__=Part, **_may_be(str, "kind"), **_may_be(N
 Size = create_model("Size", __base__=Part, **_may_be(Number, "own", "common"))
 Machine = create_model("Machine", __base__=Part, **_may_be(str, "device"),
                        **_may_be(int, "cells_per_gpu", "cells_at_once"))
-RowFile = create_model(  # older rows have fewer fields
+RowFile = create_model(
     "RowFile", __base__=Part, cell=(str, ...), suite=(str, ...), ok=(bool, ...), method=(str, ...),
     blend_mode=(str, ...), scene=(str, ...), seed=(int, ...),
     **_may_be(str, "label", "variant", "strategy", "dataset", "end", "reason"), **_may_be(int, "budget", "iterations"),
@@ -85,7 +85,7 @@ def _object(text: str, place: str) -> Dict[str, Any]:
         raise ReportError(f"{place}: not valid json, as `dsmoe bench run` writes it ({error})") from error
     if not isinstance(found, dict):
         raise ReportError(f"{place}: expected one object, as `dsmoe bench run` writes it")
-    return of_today(found)
+    return found
 
 
 def _typed(found: Dict[str, Any], place: str, model: Type[Any] = RowFile) -> Row:
@@ -123,7 +123,7 @@ def _listed(text: str, path: str) -> List[Row]:
             place = f"{path}, line {number}"
             entry = _object(line, place)
             if isinstance(entry.get(SHARED), dict):
-                shared = of_today(entry[SHARED])
+                shared = entry[SHARED]
             else:
                 found.append(_typed(_merged(shared, entry), place))
     return found

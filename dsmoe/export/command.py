@@ -7,7 +7,7 @@ import tempfile
 from typing import Any, Dict, Optional, Tuple
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.settings import GATED_MODES, record_of
+from diff_smoe_rasterization.settings import GATED_MODES
 
 from ..choices import BAKE_ITERATIONS
 from ..choices import EXPORT_FORMATS as FORMATS
@@ -99,7 +99,7 @@ def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], ove
 
 def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: bool) -> None:
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
-    recorded: Dict[str, Any] = {"blend_mode": record_of(mode),
+    recorded: Dict[str, Any] = {"blend_mode": mode,
                                 "background_gate": float(gate) if mode in GATED_MODES else None}
     others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # of an older name
     with new_file(path, overwrite) as temporary:

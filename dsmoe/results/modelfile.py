@@ -10,10 +10,7 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import (
     BLEND_MODES,
     GATED_MODES,
-    mode_of_record,
-    record_of,
     resolve_background_gate,
-    said_of_record,
 )
 
 from ..errors import TrainerError
@@ -28,7 +25,6 @@ class Recorded(NamedTuple):
 
     blend_mode: Optional[str]
     background_gate: Optional[float]
-    note: str = ""  # what to tell the user of it
 
 
 def model_path(output: str, iteration: int) -> str:
@@ -49,7 +45,7 @@ def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate
     raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
     gaussians = io.Gaussians(
         means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
-        log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=record_of(blend_mode),
+        log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode,
         background_gate=background_gate if blend_mode in GATED_MODES else None)
     with new_file(path) as temporary:
         io.write_gaussians(temporary, gaussians)
@@ -73,9 +69,7 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
                            "infinite, so the rasterizer shows none; was the training diverging?")
     model = GaussianModel(raw, stored.sh_degree)
     model.active_sh_degree = stored.sh_degree
-    record = stored.blend_mode
-    mode = record if record is None else mode_of_record(record)
-    return model, Recorded(mode, stored.background_gate, said_of_record(record))
+    return model, Recorded(stored.blend_mode, stored.background_gate)
 
 
 def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:
@@ -105,7 +99,7 @@ def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) 
 def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> float:
     """The background gate to render a .ply with in this blend mode: by the rules of `agreed_blend_mode`.
 
-    A file that records `smoe_eq7` and no gate is an older one, trained with 0. Raises TrainerError.
+    A file that records a mode and no gate was trained with 0. Raises TrainerError.
     """
     if blend_mode not in GATED_MODES:
         fixed = float(resolve_background_gate(blend_mode, None))

@@ -114,10 +114,9 @@ class Gaussians {
       const auto tensor = value(parameter).detach().cpu().contiguous();
       return std::vector<float>(tensor.data_ptr<float>(), tensor.data_ptr<float>() + tensor.numel());
     };
-    const std::string record(dsmoe::record_of(dsmoe::blend_mode_of(blend_mode).value()));
     dsmoe::io::GaussianModel model{
         static_cast<size_t>(count()), recipe_.sh_degree, numbers(kMeans),     numbers(kDc), numbers(kShs),
-        numbers(kOpacities),          numbers(kScales),  numbers(kRotations), record};
+        numbers(kOpacities),          numbers(kScales),  numbers(kRotations), blend_mode};
     if (blend_mode == "smoe" || blend_mode == "smoe_eq7") model.background_gate = background_gate;
     dsmoe::io::write_gaussians(path, model);
   }

@@ -22,15 +22,6 @@ TEST(BlendModeOf, FindsEveryModeByItsName) {
   EXPECT_FALSE(blend_mode_of(""));
 }
 
-TEST(BlendModeOfRecord, ReadsWhatIsWrittenAndWhatVersion01Wrote) {
-  BlendModes::for_each([](auto mode) { EXPECT_EQ(blend_mode_of_record(record_of(mode())), mode()); });
-  EXPECT_EQ(record_of(BlendMode::kSmoe), "smoe_tails");
-  EXPECT_EQ(record_of(BlendMode::kSmoeEq7), "smoe_eq7");
-  EXPECT_EQ(blend_mode_of_record("smoe"), BlendMode::kSmoeEq7);
-  EXPECT_FALSE(blend_mode_of_record("Smoe"));
-  EXPECT_FALSE(blend_mode_of_record(""));
-}
-
 TEST(ProjectedGaussian, IsAsManyNumbersAsItsConstantSays) {
   // Bindings allocate it as an array of numbers.
   EXPECT_EQ(sizeof(ProjectedGaussian<float>), kProjectedGaussianSize * sizeof(float));

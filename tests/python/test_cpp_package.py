@@ -248,7 +248,7 @@ def test_the_cpp_trainer_is_as_good_as_pythons(tmp_path_factory, tmp_path, optio
     model = diff_smoe_rasterization.io.read_gaussians(
         str(tmp_path / "cpp" / "point_cloud" / "iteration_300" / "point_cloud.ply"))
     assert abs(len(model.means3D) / theirs["num_gaussians"] - 1) < 0.1  # seeds: 5%
-    assert model.blend_mode == settings_module.record_of(options[1] if options else "alpha")
+    assert model.blend_mode == (options[1] if options else "alpha")
     assert (model.background_gate is not None) == (model.blend_mode != "alpha")
     if "--background-gate" in options:
         assert model.background_gate == 0

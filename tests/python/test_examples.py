@@ -53,7 +53,7 @@ def test_training_lowers_the_loss_and_records_the_blend(model):
     losses = [float(value) for value in re.findall(r"loss ([\d.]+)", text)]
     assert losses[-1] < 0.8 * losses[0]
     stored = io.read_gaussians(path)
-    assert (stored.blend_mode, stored.background_gate, stored.sh_degree) == ("smoe_tails", 0.0, 0)
+    assert (stored.blend_mode, stored.background_gate, stored.sh_degree) == ("smoe", 0.0, 0)
 
 
 def test_a_ply_is_rendered(model, tmp_path):

@@ -21,7 +21,7 @@ struct GaussianModel {
   std::vector<float> opacity_logits;       // [N, 1]
   std::vector<float> log_scales;           // [N, 3]
   std::vector<float> rotations;            // [N, 4] (w, x, y, z), not normalised
-  std::string blend_mode;                  // what "comment blend_mode NAME" records (record_of, params.h), or empty
+  std::string blend_mode;                  // what "comment blend_mode NAME" records, or empty
   std::optional<double> background_gate;   // what "comment background_gate VALUE" records, likewise
   std::vector<std::string> comments = {};  // all comment lines, these included
 };

@@ -33,29 +33,13 @@ inline int64_t band_tiles(const TileGrid& grid, const TileBand& band) {
   return static_cast<int64_t>(grid.columns) * (min(band.end, grid.rows) - band.begin);
 }
 
-// The mode that settings name so; absent where no mode has the name.
+// The mode of that name, as settings and files have it; absent if there is none.
 inline std::optional<BlendMode> blend_mode_of(std::string_view name) {
   std::optional<BlendMode> found;
   BlendModes::for_each([&](auto mode) {
     if (name == Blend<decltype(mode)::value>::kName) found = mode();
   });
   return found;
-}
-
-// The name under which files record a mode. "smoe" in a file is the rule of version 0.1, which is kSmoeEq7.
-inline std::string_view record_of(BlendMode mode) {
-  std::string_view record;
-  BlendModes::for_each([&](auto of) {
-    if (mode == of()) record = Blend<decltype(of)::value>::kName;
-  });
-  return mode == BlendMode::kSmoe ? "smoe_tails" : record;
-}
-
-// The mode that a file records so; absent where none is.
-inline std::optional<BlendMode> blend_mode_of_record(std::string_view record) {
-  if (record == Blend<BlendMode::kSmoe>::kName) return BlendMode::kSmoeEq7;
-  if (record == record_of(BlendMode::kSmoe)) return BlendMode::kSmoe;
-  return blend_mode_of(record);
 }
 
 template <class S> struct GaussianInputs {

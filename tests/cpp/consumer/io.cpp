@@ -11,7 +11,7 @@ int main() {
   model.opacity_logits = {0.5f};
   model.log_scales = {-1, -2, -3};
   model.rotations = {1, 0, 0, 0};
-  model.blend_mode = "smoe_tails";
+  model.blend_mode = "smoe";
   const char* path = "consumer_io.ply";
   dsmoe::io::write_gaussians(path, model);
   const dsmoe::io::GaussianModel read = dsmoe::io::read_gaussians(path);

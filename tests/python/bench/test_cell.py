@@ -111,5 +111,5 @@ def test_a_cell_of_a_budget_ends_with_it(worked, content, tmp_path, monkeypatch)
     row = worked("out", strategies=["importance"], budgets=[40], protocol={**content["protocol"], "options": options})
     assert row["ok"], row["reason"]
     assert row["num_gaussians"] == row["budget"] == row["protocol"]["budget"] == 40
-    assert row["protocol"]["recipe"]["strategy_options"] == "overshoot=2" and "_gate_0.005_n40_s0_" in row["cell"]
+    assert row["protocol"]["recipe"]["strategy_options"] == "overshoot=2" and "_importance_0.005_n40_s0_" in row["cell"]
     assert there == [True]

@@ -224,7 +224,7 @@ def test_rows_of_a_rarer_protocol_are_left_out_and_named(name, value):
 
 
 def test_rules_that_one_row_does_not_state_are_not_compared():
-    """Rows of earlier versions state fewer, and a checkout's recipe lacks some names of the native one."""
+    """A checkout's recipe lacks some names of the native one."""
     bare = {name: value for name, value in PROTOCOL.items() if name not in ("recipe", "sh_degree")}
     entries = [row(protocol={**bare, "scale_recipe": None}), row(seed=1),
                row(seed=2, protocol={**PROTOCOL, "recipe": {"feature_lr": 0.0025, "opacity_lr": None}})]
@@ -232,22 +232,6 @@ def test_rules_that_one_row_does_not_state_are_not_compared():
     entries.append(row(seed=3, protocol={**PROTOCOL, "recipe": {"feature_lr": 0.01}}))
     kept, (told,) = rows.of_one_protocol(entries)
     assert kept == entries[:3] and "recipe.feature_lr is 0.01 in them and 0.0025 in 2 others" in told
-
-
-def test_rows_that_call_the_strategy_schedule_are_read(tmp_path):
-    """Earlier versions did, and called the strategy `importance` `gate`."""
-    entries = [row(blend_mode=mode, strategy=strategy, budget=100, protocol={**PROTOCOL, "strategy": strategy})
-               for mode in ("alpha", "smoe") for strategy in ("steady", "importance")]
-    earlier = json.loads(json.dumps(entries).replace('"strategy"', '"schedule"').replace('"importance"', '"gate"'))
-    assert earlier[1]["schedule"] == earlier[1]["protocol"]["schedule"] == "gate"
-    expected = sorted(entries, key=lambda entry: entry["cell"])
-    assert rows.read_rows(write_rows(tmp_path, earlier)) == expected
-    text = rows.packed([{**entry, "history": None} for entry in earlier + earlier[1:2]])  # `gate` is the commonest
-    shared = json.loads(text.partition("\n")[0])["shared"]
-    assert shared["schedule"] == shared["protocol"]["schedule"] == "gate" and text.count('"schedule":"steady"') == 4
-    (tmp_path / "rows.jsonl").write_text(text, encoding="utf-8")
-    kept = [{name: value for name, value in entry.items() if name != "history"} for entry in expected]
-    assert rows.read_rows(str(tmp_path)) == kept
 
 
 @pytest.mark.parametrize("text, reason", [

@@ -50,18 +50,6 @@ def test_gates_are_of_smoe_alone(content):
     assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
 
 
-def test_cells_are_named_as_before_strategies_had_their_names():
-    """So that earlier rows are found; commit aeb180a gave these names, for `schedules` with `gate` and `steady`."""
-    def cell(strategy, budget):
-        content = {"name": "one", "scenes": [{"name": "tiny", "path": "scene"}], "methods": [{"name": "native"}],
-                   "blend_modes": ["alpha"], "densify_grad_thresholds": [0.0002], "strategies": [strategy],
-                   "budgets": [budget]}
-        return expand(content, "").cells[0]["id"]
-
-    assert cell("importance", 40) == "native_tiny_alpha_gate_0.0002_n40_s0_fde6de"
-    assert cell("steady", 0) == "native_tiny_alpha_steady_0.0002_s0_bc42d5"
-
-
 def test_the_axes_of_the_command_line_are_those_of_the_schema():
     assert list(AXIS_OF) == list(schema.Axes.model_fields)
 
@@ -254,7 +242,7 @@ def test_the_suite_of_the_readme_is_valid(somewhere):
 
 
 @pytest.mark.parametrize("name, lacking", [("captures", set()), ("gate", {0.03, 0.3, "learned"})])
-def test_rows_from_before_there_were_gates_are_of_todays_cells(name, lacking, somewhere):
+def test_the_rows_of_the_repository_are_of_todays_cells(name, lacking, somewhere):
     """They are of Eq. 7; the suite of gates has some of them."""
     rows = BENCHMARKS / "results" / "captures_h200.jsonl"
     if not rows.is_file():

@@ -100,7 +100,7 @@ def test_a_gpu_that_cannot_blend_32_bit_floats_is_told_of(browser, tmp_path):  #
 @pytest.mark.slow
 def test_the_mouse_turns_it_and_the_switch_shows_what_other_viewers_do(browser, tmp_path):  # noqa: F811
     model, page = str(tmp_path / "model.ply"), str(tmp_path / "page.html")
-    io.write_gaussians(model, io.Gaussians(**{**vars(cloud()), "blend_mode": "smoe_tails", "background_gate": 0.03}))
+    io.write_gaussians(model, io.Gaussians(**{**vars(cloud()), "blend_mode": "smoe", "background_gate": 0.03}))
     assert main(["export", model, "-o", page]) == 0
     browser.open(f"file://{page}", 320, 240)
     drawn = "document.body && document.body.dataset.drawn === 'true'"

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings, settings
-from diff_smoe_rasterization.settings import GATED_MODES, record_of, resolve_blend
+from diff_smoe_rasterization.settings import GATED_MODES, resolve_blend
 from dsmoe.patches import runtime
 
 ALPHA = {"blend_mode": "alpha", "background_gate": None}
@@ -44,11 +44,11 @@ def test_the_blend_of_a_run(mode, variable, monkeypatch):
     if variable:
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
     gate = float(variable or 0) if mode in GATED_MODES else None
-    for dataset in (run(mode, white_background=False), run(record_of(mode), 0.25 if variable else 0.0)):
+    for dataset in (run(mode, white_background=False), run(mode, 0.25 if variable else 0.0)):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert runtime.blend_of(dataset) == {"blend_mode": mode, "background_gate": gate}
-        assert (dataset.blend_mode, dataset.background_gate) == (record_of(mode), gate)  # what is saved of it
+        assert (dataset.blend_mode, dataset.background_gate) == (mode, gate)  # what is saved of it
 
 
 @pytest.mark.parametrize("mode, gate", [("smoe", 0.25), ("smoe_tn", 0), ("alpha", 1)])
@@ -80,31 +80,11 @@ def test_a_wrong_gate_is_refused_by_name(mode, gate, variable, message, monkeypa
         runtime.blend_of(run(mode, gate))
 
 
-def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(tmp_path):
+def test_a_model_in_smoe_without_a_gate_has_0_and_says_so(tmp_path):
     (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe')")
     old = SimpleNamespace(blend_mode="smoe", model_path=str(tmp_path))
     with pytest.warns(UserWarning, match="records no background gate, so it is 0 "):
-        assert runtime.blend_of(old) == {"blend_mode": "smoe_eq7", "background_gate": 0}
-
-
-def test_smoe_of_an_earlier_cfg_args_is_smoe_eq7_and_says_so(monkeypatch, tmp_path, capsys):
-    """Until a training writes it anew: the typed name, or the variable's, is the rule of today there."""
-    path, eq_7 = tmp_path / "cfg_args", {"blend_mode": "smoe_eq7", "background_gate": 0.5}
-    path.write_text("Namespace(blend_mode='smoe', background_gate=0.5)")
-    for words in ([], ["--blend_mode", "smoe"]):
-        monkeypatch.setattr(sys, "argv", ["render.py", *words])
-        assert runtime.saved_blend_of(run("smoe", model_path=str(tmp_path))) == eq_7
-        assert runtime.blend_of(run("smoe", 0.5, model_path=str(tmp_path))) == eq_7  # with the options of cfg_args
-    line, mode = capsys.readouterr().err.splitlines()
-    assert f"{path}: it records the blend mode smoe of an earlier version, which is smoe_eq7 now" in line
-    assert "blend mode smoe_eq7, background gate 0.5" in mode
-    training = run("smoe", "0.5", model_path=str(tmp_path))
-    with pytest.warns(UserWarning, match="a run with blend_mode smoe_eq7, .* has smoe; .*--blend_mode smoe_eq7"):
-        assert runtime.blend_of(training) == {"blend_mode": "smoe", "background_gate": 0.5}
-    path.write_text(f"Namespace(blend_mode={training.blend_mode!r}, background_gate=0.5)")  # as the trainer does
-    monkeypatch.setattr(sys, "argv", ["render.py"])
-    assert runtime.saved_blend_of(run("alpha", model_path=str(tmp_path))) == {
-        "blend_mode": "smoe", "background_gate": 0.5}
+        assert runtime.blend_of(old) == {"blend_mode": "smoe", "background_gate": 0}
 
 
 AUTHORS = {"blend_mode": "smoe", "background_gate": 0, "faint_below": 2}  # as the paper's authors' program renders
@@ -126,7 +106,7 @@ def test_a_model_of_the_authors_program_is_smoe_without_a_warning(tmp_path, caps
         warnings.simplefilter("error")
         assert runtime.saved_smoe_of(theirs) == AUTHORS
         assert "records no blend mode, so it is smoe with the gate 0" in capsys.readouterr().err
-        ours = model(tmp_path, f"Namespace(blend_mode={record_of('smoe')!r}, background_gate=0.5, init_path='default')")
+        ours = model(tmp_path, "Namespace(blend_mode='smoe', background_gate=0.5, init_path='default')")
         assert runtime.saved_smoe_of(ours) == {**AUTHORS, "background_gate": 0.5}
         assert runtime.saved_smoe_of(model(tmp_path, "Namespace(blend_mode='alpha', background_gate=None)")) == ALPHA
 
@@ -165,7 +145,7 @@ def test_one_line_says_which_mode_it_is(capsys):
 def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):
     """A rendering without the flag has the mode of cfg_args; a training, resumed or not, has the default."""
     with pytest.warns(UserWarning, match="a run with blend_mode smoe, .* has alpha; .*--blend_mode smoe$"):
-        runtime.blend_of(model(tmp_path, "Namespace(sh_degree=3, blend_mode='smoe_tails')"))
+        runtime.blend_of(model(tmp_path, "Namespace(sh_degree=3, blend_mode='smoe')"))
     for text in ("Namespace(blend_mode='alpha')", "Namespace(sh_degree=3)", "", "no Python",
                  "Namespace(blend_mode=f())", "__import__('os').mkdir('x')"):
         with warnings.catch_warnings():
@@ -180,7 +160,7 @@ def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):
 
 def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch, tmp_path):
     """InstantSplat's render.py makes ModelParams with defaults, which then win over cfg_args."""
-    (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe_tails', background_gate=0.5)")
+    (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe', background_gate=0.5)")
 
     def rendered(*words):
         monkeypatch.setattr(sys, "argv", ["render.py", *words])
@@ -204,7 +184,7 @@ def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch
 
 def test_a_path_that_looks_like_an_option_is_none(monkeypatch, tmp_path):
     """Python 3.8 writes a Namespace sorted by name: the path comes last."""
-    saved = "Namespace(background_gate=0.5, blend_mode='smoe_tails', model_path='out/background_gate=0.03')"
+    saved = "Namespace(background_gate=0.5, blend_mode='smoe', model_path='out/background_gate=0.03')"
     (tmp_path / "cfg_args").write_text(saved)
     assert runtime.saved_blend_of(run("alpha", model_path=str(tmp_path))) == {
         "blend_mode": "smoe", "background_gate": 0.5}

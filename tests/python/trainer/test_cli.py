@@ -127,10 +127,6 @@ def test_help_has_groups_and_a_wrong_mode_is_named_where_it_is_given(scene, caps
     usage, error = capsys.readouterr().err.rsplit("\n", 2)[:2]
     assert usage.count("\n") <= 1, "the error is not behind a page of options"
     assert "argument --blend-mode: invalid choice: 'smo' (choose from" in error and "smoe_tn" in error
-    for words in (["train", scene, "-o", "out"], ["view", "out"], ["run"]):
-        with pytest.raises(SystemExit):
-            main([*words, "--blend-mode", "smoe_tails"])
-        assert "is 'smoe_tails'; it must be smoe, which files call smoe_tails" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["train", scene, "-o", "out", "--itertions", "5"])
     assert "unrecognized arguments: --itertions 5 (is --iterations meant?)" in capsys.readouterr().err
@@ -467,58 +463,6 @@ def test_a_model_of_the_papers_authors_is_rendered_by_smoe_with_the_gate_0(train
     nowhere = ["-o", str(tmp_path / "no")]
     assert "authors' program" in fails(capsys, "render", str(ply), "--scene", scene, "--blend-mode", "smoe", *nowhere)
     assert "name the .ply" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)
-
-
-def test_smoe_of_an_earlier_version_is_smoe_eq7_and_a_line_says_so(trained, scene, tmp_path, capsys):
-    run = str(tmp_path / "run")
-    shutil.copytree(trained, run)
-    edit_config(run, blend_mode="smoe")
-    with open(ply_of(run), "rb") as file:
-        content = file.read().replace(b"comment blend_mode smoe_eq7\n", b"comment blend_mode smoe\n")
-    with open(ply_of(run), "wb") as file:
-        file.write(content)
-    with open(os.path.join(run, "results.json"), encoding="utf-8") as file:
-        rows = file.read().replace('"smoe_eq7"', '"smoe"')
-    with open(os.path.join(run, "results.json"), "w", encoding="utf-8") as file:
-        file.write(rows)
-    said = f"note: {ply_of(run)}: it records the blend mode smoe of an earlier version, which is smoe_eq7 now;"
-    commands = {"eval": [run], "render": [run, "-o", str(tmp_path / "old")],
-                "export": [ply_of(run), "-o", str(tmp_path / "new.ply")]}
-    for command, words in commands.items():
-        capsys.readouterr()
-        assert main([command, *words]) == 0
-        line, = capsys.readouterr().err.splitlines()
-        assert line.startswith(said), command
-    before, after = results_of(trained)[0], results_of(run)[0]
-    for name in ("blend_mode", "psnr", "train_seconds"):
-        assert after[name] == before[name], name
-    assert io.read_gaussians(str(tmp_path / "new.ply")).blend_mode == "smoe_eq7"
-    capsys.readouterr()
-    assert main(["render", trained, "-o", str(tmp_path / "images")]) == 0
-    assert capsys.readouterr().err == ""
-    old, new = (open(tmp_path / folder / "view_000.png", "rb").read() for folder in ("old", "images"))
-    assert old == new
-
-
-def test_a_run_from_before_the_background_gate_is_of_the_paper(scene, tmp_path, monkeypatch):
-    """Without a gate in config.json and .ply it evaluates as it did: with 0."""
-    output = str(tmp_path / "out")
-    assert main(["train", scene, "-o", output, "--blend-mode", "smoe_eq7", "--background-gate", "0", *SHORT]) == 0
-    before, = results_of(output)
-    path = os.path.join(output, "config.json")
-    with open(path, encoding="utf-8") as file:
-        config = {name: value for name, value in json.load(file).items() if not name.startswith("background_gate")}
-    with open(path, "w", encoding="utf-8") as file:
-        json.dump(config, file)
-    with open(ply_of(output), "r+b") as file:
-        content = file.read().replace(b"comment background_gate 0\n", b"")
-        file.seek(0)
-        file.write(content)
-        file.truncate()
-    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")
-    assert main(["eval", output]) == 0
-    after, = results_of(output)
-    assert (after["psnr"], after["background_gate"]) == (before["psnr"], 0.0)
 
 
 @pytest.mark.parametrize("mode, gate, warns", [

@@ -8,7 +8,6 @@ import os
 
 import pytest
 
-from diff_smoe_rasterization.settings import record_of
 from dsmoe.config import TrainConfig
 from dsmoe.config_arguments import add_arguments, config_from_arguments
 from dsmoe.errors import ConfigError
@@ -100,14 +99,6 @@ def test_how_a_gate_is_learned_follows_the_mode_unless_given(tmp_path):
     given.changed(scene="s", output=str(tmp_path)).save(str(tmp_path))
     assert learned(TrainConfig.load(str(tmp_path))) == (0, 0.5, 0.02)
 
-    values = json.loads((tmp_path / "config.json").read_text())
-    for name in ("background_gate_start", "background_gate_lr"):  # as version 0.1 wrote it
-        del values[name]
-    values.update(blend_mode="smoe", background_gate_bound=0.03)
-    (tmp_path / "config.json").write_text(json.dumps(values))
-    old = TrainConfig.load(str(tmp_path))
-    assert (old.blend_mode, *learned(old)) == ("smoe_eq7", 0.03, 1, 0.01)
-
 
 @pytest.mark.parametrize("option", ["start", "bound", "lr"])
 def test_how_a_gate_is_learned_is_refused_where_none_is(monkeypatch, option):
@@ -125,32 +116,14 @@ def test_how_a_gate_is_learned_is_refused_where_none_is(monkeypatch, option):
     parse("--blend-mode", "smoe", "--background-gate", "learned", *given)
 
 
-@pytest.mark.parametrize("recorded, strategy", [("gate", "importance"), ("steady", "steady"), ("mcmc", "mcmc")])
-def test_a_file_that_calls_the_strategy_schedule_still_opens(tmp_path, recorded, strategy):
-    TrainConfig(scene="s", output=str(tmp_path), budget=100).save(str(tmp_path))
+@pytest.mark.parametrize("option", ["background_gate", "blend_mode", "seed"])
+def test_an_option_that_the_file_lacks_gets_no_default(tmp_path, option):
+    TrainConfig(scene="s", output=str(tmp_path)).save(str(tmp_path))
     values = json.loads((tmp_path / "config.json").read_text())
-    assert values.pop("strategy") == "importance"
-    values["schedule"] = recorded  # as earlier versions wrote it
+    del values[option]
     (tmp_path / "config.json").write_text(json.dumps(values))
-    assert TrainConfig.load(str(tmp_path)).strategy == TrainConfig.of_record(values).strategy == strategy
-
-
-def test_schedule_is_another_name_of_the_option_and_gate_is_no_strategy(capsys):
-    assert parse("--schedule", "steady").strategy == "steady"
-    with pytest.raises(SystemExit):
-        parse("--schedule", "gate", "--budget", "9")
-    text = capsys.readouterr().err
-    assert "--strategy" in text and "'importance'" in text
-
-
-@pytest.mark.parametrize("mode, expected", [("smoe_eq7", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
-def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypatch, mode, expected):
-    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")  # must not fill the gap
-    TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode).save(str(tmp_path))
-    values = json.loads((tmp_path / "config.json").read_text())
-    assert values.pop("background_gate") == (0.7 if mode == "smoe_eq7" else expected), "the resolved one"
-    (tmp_path / "config.json").write_text(json.dumps(values))
-    assert TrainConfig.load(str(tmp_path)).background_gate == expected
+    with pytest.raises(ConfigError, match=f"config.json: .*{option} is "):
+        TrainConfig.load(str(tmp_path))
 
 
 @pytest.mark.parametrize("option, value, words", [
@@ -189,7 +162,7 @@ def test_file_round_trip(tmp_path, mode):
     config = TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode, iterations=5, white_background=True)
     config.save(str(tmp_path))
     assert TrainConfig.load(str(tmp_path)) == dataclasses.replace(config, scene=os.path.abspath("s"))
-    assert json.loads((tmp_path / "config.json").read_text())["blend_mode"] == record_of(mode)
+    assert json.loads((tmp_path / "config.json").read_text())["blend_mode"] == mode
 
 
 @pytest.mark.parametrize("edit, words", [
