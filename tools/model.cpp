@@ -105,7 +105,8 @@ BlendRules<double> choose_blend(const io::GaussianModel& model, const std::strin
   choice.mode = *chosen;
   if (!record.empty() && chosen != recorded) {
     std::fprintf(stderr, "note: %s %s the blend %s; in another one Gaussians show another scene\n", file.c_str(),
-                 is_splat ? "does not say its blend; viewers take it for" : "was trained with", io::printable(record).c_str());
+                 is_splat ? "does not say its blend; viewers take it for" : "was trained with",
+                 io::printable(record).c_str());
   }
   if (choice.mode != BlendMode::kSmoe && choice.mode != BlendMode::kSmoeEq7) {
     if (background_gate) throw UsageError("--background-gate is for --blend smoe and smoe_eq7 only");
