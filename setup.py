@@ -1,10 +1,11 @@
-"""Builds libdsmoe.so, which needs no Python, and the extension _C over it, by CMake: csrc/python/CMakeLists.txt.
+"""Builds libdsmoe.so, the torch ops and the extension _core by CMake: csrc/python/CMakeLists.txt.
 
 Metadata: pyproject.toml. Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA; unset:
 where also a GPU is seen, or cards are named), TORCH_CUDA_ARCH_LIST, MAX_JOBS; DSMOE_CUDA_ARCH=all compiles for every
 card where none is seen; DSMOE_CORE_FOLDER=DIR links the libraries that CMake has built in DIR (libdsmoe_core.a,
-libdsmoe_io.a, libdsmoe_cuda.a) in place of compiling their sources once more; DSMOE_STABLE_ABI=1 makes _C by LibTorch's
-stable ABI and Python's limited API: it loads with every PyTorch from 2.11 on, and libdsmoe.so has no ops for C++.
+libdsmoe_io.a, libdsmoe_cuda.a) in place of compiling their sources once more; DSMOE_STABLE_ABI=1 makes the ops by
+LibTorch's stable ABI: they load with every PyTorch from 2.11 on; then DSMOE_PYTHONS="python3.10 python3.12" builds
+_core for these Pythons too, and a wheel is for all of them.
 """
 import json
 import os
@@ -27,8 +28,8 @@ EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
 USUAL_CARDS = (80, 90)
 # On one core of an AMD EPYC; a kernel's file for the usual cards.
 SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
-# The oldest PyTorch whose stable ABI has what the ops take, as its headers write it, and the oldest Python of that one.
-STABLE_ABI_SINCE, TORCH_TARGET_VERSION, STABLE_PYTHON = "2.11", "0x020b000000000000", "cp310"
+# The oldest PyTorch whose stable ABI has what the ops take, and as its headers write it.
+STABLE_ABI_SINCE, TORCH_TARGET_VERSION = "2.11", "0x020b000000000000"
 # The folders at the top that are parts of packages, by the link that puts each there.
 LINKS = {"diff_smoe_rasterization/integrations": "../integrations", "dsmoe/patches": "../patches"}
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
@@ -148,6 +149,22 @@ def architecture_flags(nvcc, torch):
     return [f"-gencode=arch=compute_{number},code={kind}" for number, kind in kinds]
 
 
+def pybind11_folder(torch):
+    """Returns the folder of pybind11's headers: those of the package, or where it is not installed PyTorch's copy."""
+    try:
+        import pybind11
+    except ImportError:
+        return os.path.join(os.path.dirname(torch.__file__), "include")
+    return pybind11.get_include()
+
+
+def pythons(stable):
+    """Returns the Pythons that _core is built for, as {suffix of extensions: folder of headers}."""
+    ask = "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'), sysconfig.get_path('include'), sep='\\n')"
+    asked = os.environ.get("DSMOE_PYTHONS", "").split() if stable else []
+    return dict(answer(python, "-c", ask).splitlines() for python in [sys.executable, *asked])
+
+
 def options_of_cmake(torch, cpp_extension, with_cuda, stable):
     """Returns what CMakeLists.txt asks: this Python, this PyTorch, and for which cards, as {name: value}."""
     release = tuple(int(number) for number in torch.__version__.split(".")[:2])
@@ -162,6 +179,8 @@ def options_of_cmake(torch, cpp_extension, with_cuda, stable):
         "DSMOE_CXX11_ABI": int(torch.compiled_with_cxx11_abi()),
         "DSMOE_CXX_STANDARD": 17 if release < (2, 13) else 20,
         "DSMOE_INCLUDES": ";".join(includes),
+        "DSMOE_PYBIND11": pybind11_folder(torch),
+        "DSMOE_PYTHONS": ";".join("=".join(one) for one in pythons(stable).items()),
         "DSMOE_LIBRARY_FOLDERS": ";".join(cpp_extension.library_paths()),
         "DSMOE_CORE_FOLDER": os.path.abspath(core) if core else "",
     }
@@ -207,11 +226,11 @@ def replace(source, target):
 
 
 def extension():
-    """Returns the arguments of setup() that build libdsmoe.so and `diff_smoe_rasterization._C`."""
+    """Returns the arguments of setup() that build libdsmoe.so, _ops.so and `diff_smoe_rasterization._core`."""
     torch, cpp_extension = import_build_tools()
     without_cuda = reasons_against_cuda(torch, cpp_extension.CUDA_HOME)
     stable = os.environ.get("DSMOE_STABLE_ABI", "0") == "1"
-    module = setuptools.Extension(f"{PACKAGE}._C", [], py_limited_api=stable)
+    module = setuptools.Extension(f"{PACKAGE}._core", [])
     built_against = {
         "TORCH_VERSION": torch.__version__,
         "CUDA_VERSION": None if without_cuda else torch.version.cuda,
@@ -231,14 +250,27 @@ def extension():
             run_cmake("--build", folder, "--parallel", jobs(), "--target", "dsmoe_package")
             path = Path(self.get_ext_fullpath(module.name))
             path.parent.mkdir(parents=True, exist_ok=True)
-            replace(folder / "package" / "_C.so", path)
-            replace(folder / "package" / "libdsmoe.so", path.with_name("libdsmoe.so"))
+            for name in ("libdsmoe.so", "_ops.so", *(f"_core{suffix}" for suffix in pythons(stable))):
+                replace(folder / "package" / name, path.with_name(name))
             lines = ['"""What the extension was built against; readable even where it cannot be loaded."""']
             lines += [f"{name} = {value!r}" for name, value in built_against.items()]
             path.with_name("_build_info.py").write_text("\n".join(lines) + "\n")
 
-    tag = {"options": {"bdist_wheel": {"py_limited_api": STABLE_PYTHON}}} if stable else {}
-    return {"ext_modules": [module], "cmdclass": {"build_ext": BuildExtension}, **tag}
+    return {"ext_modules": [module], "cmdclass": {"build_ext": BuildExtension, **(any_python() if stable else {})}}
+
+
+def any_python():
+    """Returns the command that names a wheel py3-none: which Pythons it is for, its files _core say."""
+    try:
+        from setuptools.command.bdist_wheel import bdist_wheel
+    except ImportError:  # setuptools before 70.1
+        from wheel.bdist_wheel import bdist_wheel
+
+    class AnyPython(bdist_wheel):
+        def get_tag(self):
+            return ("py3", "none", super().get_tag()[2])
+
+    return {"bdist_wheel": AnyPython}
 
 
 def commit():

@@ -112,7 +112,7 @@ up_to_date() {
 
 # Makes the environment where there is none, and installs what was asked for as PyTorch.
 install_torch() {
-  local python=${DSMOE_PYTHON:-python3} over_system=() tools=("setuptools>=61,<82" wheel ninja)
+  local python=${DSMOE_PYTHON:-python3} over_system=() tools=("setuptools>=61,<82" wheel ninja pybind11)
   if [ -n "${DSMOE_PYTHON-}" ] && [ -x "$venv/bin/python" ] &&
     [ "$("$python" --version)" != "$("$venv/bin/python" --version)" ]; then
     fail "$venv holds $("$venv/bin/python" --version), but DSMOE_PYTHON is $("$python" --version):" \

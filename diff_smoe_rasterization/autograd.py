@@ -11,23 +11,24 @@ import contextlib
 import torch
 from torch.autograd import forward_ad
 
-from .extension import _C  # loading it registers the ops
+from .core import _core
+from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 from .settings import FEATURE_OUTPUTS
 
 _OPS = torch.ops.diff_smoe_rasterization
 _CAN_REGISTER = hasattr(torch.library, "register_autograd")
 
-INPUTS, IMAGES = _C.inputs, _C.images
+INPUTS, IMAGES = _core.inputs, _core.images
 """The names of the op's tensors, and of the images among its results. csrc/torch/fields.h lists them."""
 
 _PYTHON_TYPES = {"SymInt": int, "int": int, "float": float, "bool": bool}
-OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _C.options.items()}
+OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _core.options.items()}
 """The op's other arguments with their types, in order: what `csrc/torch/fields.h` lists."""
 
 _NUM_INPUTS, _NUM_IMAGES = len(INPUTS), len(IMAGES)
 _RADII, _DEPTH = IMAGES.index("radii"), IMAGES.index("depth")
 _BLEND_MODE = list(OPTIONS).index("blend_mode")
-_DIVIDES = {mode["number"]: mode["divides"] for mode in _C.blend_modes.values()}
+_DIVIDES = {mode["number"]: mode["divides"] for mode in _core.blend_modes.values()}
 
 
 # Eager calls skip the Python wrapper that register_autograd puts around an op, because they have the formula already.
@@ -141,7 +142,7 @@ def _fake_rasterize(*arguments):
         shape = shapes.get(name, (1, height, width)) if wanted else (0,)
         images.append(means3D.new_empty(shape, dtype=torch.int32 if name == "radii" else means3D.dtype))
     saved = []
-    for name, kind, columns in _C.saved["cuda" if means3D.device.type == "cuda" else "cpu"]:
+    for name, kind, columns in _core.saved["cuda" if means3D.device.type == "cuda" else "cpu"]:
         rows = count if name == "projected" else torch.library.get_ctx().new_dynamic_size()
         saved.append(means3D.new_empty((rows,) if columns == 1 else (rows, columns),
                                        dtype=means3D.dtype if kind == "real" else getattr(torch, kind)))

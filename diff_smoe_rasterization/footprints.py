@@ -15,7 +15,7 @@ import torch
 
 from .arguments import as_rendering, op_arguments, op_options, tensor_checks
 from .autograd import INPUTS, OPTIONS, refuse_forward_mode
-from .extension import _C
+from .core import _core
 from .settings import BLEND_MODES, GaussianRasterizationSettings, Rendering, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -140,7 +140,7 @@ def _reach_moves(opacities: torch.Tensor, options: Dict[str, Any], gate: Optiona
 
     Elsewhere the reach is constant. The rule is that of `squared_reach` and `AlphaCut` in include/dsmoe/gate.h.
     """
-    positive, constants = opacities > 0, _C.constants
+    positive, constants = opacities > 0, _core.constants
     if BLEND_MODES[options["blend_mode"]] in ("alpha", "smoe"):
         return positive
     faint = constants["alpha_cut"] * (options["fixed_background_gate"] if gate is None else gate.reshape(()))

@@ -7,7 +7,7 @@ import torch
 
 from .autograd import refuse_forward_mode
 from .checks import check_tensors, checked_number
-from .extension import _C  # noqa: F401  (loading it registers the ops)
+from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
 

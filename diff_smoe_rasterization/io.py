@@ -11,9 +11,9 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
-from .extension import _C
+from .core import _core
 
-_io = _C.io
+_io = _core.io
 
 PathLike = Union[str, "os.PathLike[str]"]
 

@@ -13,7 +13,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import torch
 
 from .checks import check_tensors
-from .extension import _C  # noqa: F401  (loading it registers the ops)
+from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 from .optimizers import FusedAdam, corrected_rates
 
 _OPS = torch.ops.diff_smoe_rasterization

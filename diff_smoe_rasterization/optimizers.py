@@ -7,7 +7,7 @@ from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
 import torch
 
 from .checks import check_tensors, checked_number
-from .extension import _C  # noqa: F401  (loading it registers the ops)
+from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
 

@@ -79,7 +79,7 @@ class CountedRasterize:
 
     def __init__(self, op: Any, missing: List[torch.Tensor]) -> None:
         self._op, self._missing = op, missing
-        names = [name for name, *_ in extension._C.saved["cuda"]]
+        names = [name for name, *_ in extension._core.saved["cuda"]]
         self._offsets, self._instances = names.index("tile_offsets"), names.index("instances")
 
     def __call__(self, *arguments: Any) -> Any:

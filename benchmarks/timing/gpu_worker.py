@@ -149,7 +149,7 @@ def num_instances(renderer: Ours, settings) -> int:
     from diff_smoe_rasterization import extension, rasterize_with_splats
     with torch.no_grad():
         _, splats = rasterize_with_splats(settings=settings, **renderer.parameters)
-    names = [name for name, *_ in extension._C.saved["cuda"]]
+    names = [name for name, *_ in extension._core.saved["cuda"]]
     return int(splats._saved[names.index("tile_offsets")][-1])
 
 

@@ -12,7 +12,7 @@ from typing import Callable, Dict, List, NamedTuple, Optional, Sequence, Set, Tu
 import torch
 
 from diff_smoe_rasterization.direct import DirectRendering
-from diff_smoe_rasterization.extension import _C  # noqa: F401  (loading it registers the ops)
+from diff_smoe_rasterization.extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 from diff_smoe_rasterization.gaussians import activate
 from diff_smoe_rasterization.optimizers import corrected_rates
 from diff_smoe_rasterization.settings import Rendering

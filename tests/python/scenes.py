@@ -8,7 +8,7 @@ import pytest
 import torch
 from devices import default_device, random_normal
 
-from diff_smoe_rasterization.extension import _C
+from diff_smoe_rasterization.core import _core
 from diff_smoe_rasterization.settings import (
     BLEND_MODES,
     FEATURE_OUTPUTS,
@@ -22,7 +22,7 @@ BACKGROUND_GATES = {"eq7_gate": ("smoe_eq7", 0.05), "smoe_learned_gate": ("smoe"
 """Further modes of the tests: a blend mode and its background gate, a number and a tensor."""
 with_gate = pytest.mark.parametrize("mode", BLEND_MODES + ("smoe_learned_gate",))
 with_gates = pytest.mark.parametrize("mode", BLEND_MODES + tuple(BACKGROUND_GATES))
-REMOVABLE_MODES = tuple(mode for mode in BLEND_MODES if _C.blend_modes[mode]["removable"])
+REMOVABLE_MODES = tuple(mode for mode in BLEND_MODES if _core.blend_modes[mode]["removable"])
 """Those that `importance` takes."""
 with_removal = pytest.mark.parametrize("mode", REMOVABLE_MODES + ("smoe_learned_gate",))
 
@@ -204,8 +204,8 @@ def op_arguments(scene, op="rasterize", **others):
 
 def op_results(scene, **others):
     """Calls the op `rasterize` as `op_arguments` says. Returns its images and its saved tensors, each by name."""
-    from diff_smoe_rasterization.extension import _C
+    from diff_smoe_rasterization.core import _core
 
     *images, saved = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene, **others))
-    names = [name for name, _, _ in _C.saved[images[0].device.type]]
-    return dict(zip(_C.images, images)), dict(zip(names, saved))
+    names = [name for name, _, _ in _core.saved[images[0].device.type]]
+    return dict(zip(_core.images, images)), dict(zip(names, saved))

@@ -15,7 +15,8 @@ from devices import on_the_cpu, random_normal
 from scenes import assert_not_empty, random_scene, with_gate
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization import _C, reference
+from diff_smoe_rasterization import reference
+from diff_smoe_rasterization.core import _core
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -225,4 +226,4 @@ def test_the_core_has_the_constants_of_the_reference():
                 "compensation_floor": reference.COMPENSATION_MIN, "frustum_margin": reference.FRUSTUM_MARGIN,
                 "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE,
                 "core_kernel": reference.KERNEL_KEPT, "max_opacity": reference.OPACITY_MAX}
-    assert {name: _C.constants[name] for name in expected} == expected
+    assert {name: _core.constants[name] for name in expected} == expected

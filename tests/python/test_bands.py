@@ -8,7 +8,7 @@ from devices import random_normal
 from scenes import gradients, op_results, random_scene, with_gate, with_removal
 
 from diff_smoe_rasterization import rasterize, rasterize_with_splats
-from diff_smoe_rasterization.extension import _C
+from diff_smoe_rasterization.core import _core
 from diff_smoe_rasterization.settings import OUTPUTS
 
 # Six rows of tiles with 4,000 instances or more: bands of one or two rows, and single rows that exceed a band.
@@ -18,8 +18,8 @@ MOST = (1500, 100)
 @pytest.fixture
 def listing():
     """A function that says how many instances are listed at once."""
-    yield _C.set_most_instances
-    _C.set_most_instances(0)
+    yield _core.set_most_instances
+    _core.set_most_instances(0)
 
 
 def scene_of(mode, dtype=torch.float32, **settings):
@@ -93,4 +93,4 @@ def test_nothing_visible(mode, device, listing):
 
 def test_a_number_below_0_is_refused():
     with pytest.raises(ValueError, match="set_most_instances: count is -1; it must be 0 or more"):
-        _C.set_most_instances(-1)
+        _core.set_most_instances(-1)

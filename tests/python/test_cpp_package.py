@@ -164,9 +164,10 @@ def package_built_against(folder, torch_version, cuda_version, stable_abi_since=
 
 
 @needs_cmake
-def test_a_package_of_another_torch_is_not_found(tmp_path):
+def test_a_package_of_another_torch_has_all_but_the_ops(tmp_path):
     prefixes = package_built_against(tmp_path, "0.4.1", None)
-    result = subprocess.run(["cmake", "-S", str(CONSUMER), "-B", str(tmp_path / "build"), "-DCONSUMER=core",
+    assert what_is_found(tmp_path, "COMPONENTS core io", prefixes=prefixes) == (True, {"dsmoe::core", "dsmoe::io"})
+    result = subprocess.run(["cmake", "-S", str(CONSUMER), "-B", str(tmp_path / "torch"), "-DCONSUMER=torch",
                              f"-DCMAKE_PREFIX_PATH={prefixes}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                             universal_newlines=True)
     assert result.returncode != 0

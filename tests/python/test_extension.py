@@ -18,7 +18,7 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
-from diff_smoe_rasterization.extension import _C
+from diff_smoe_rasterization.core import _core
 from diff_smoe_rasterization.settings import (
     _FIXED_GATES,
     BLEND_MODES,
@@ -38,8 +38,8 @@ def copied_package(tmp_path, monkeypatch):
     """Returns (folder, import function) of a copy of the package's Python files, without the extension."""
     name = "copy_of_the_package"
     folder = tmp_path / name
-    shutil.copytree(Path(diff_smoe_rasterization.__file__).parent, folder,
-                    ignore=shutil.ignore_patterns("_C*", "_build_info.py", "__pycache__", "csrc", "include"))
+    without = shutil.ignore_patterns("_core*", "_ops.so", "_build_info.py", "__pycache__", "csrc", "include")
+    shutil.copytree(Path(diff_smoe_rasterization.__file__).parent, folder, ignore=without)
     monkeypatch.syspath_prepend(tmp_path)
     yield folder, lambda submodule="": importlib.import_module(name + submodule)
     for module in [module for module in sys.modules if module.split(".")[0] == name]:
@@ -122,9 +122,17 @@ def test_a_build_by_the_stable_abi_refuses_an_older_torch(copied_package):
 def test_an_extension_that_does_not_load_names_the_reason_and_both_versions(copied_package):
     folder, load = copied_package
     (folder / "_build_info.py").write_text(f"TORCH_VERSION = {torch.__version__!r}\n")
-    (folder / ("_C" + sysconfig.get_config_var("EXT_SUFFIX"))).write_bytes(b"not a shared library")
-    with pytest.raises(ImportError, match="does not load.*_C.*built against torch.*pip install"):
-        load().rasterize
+    for name, words in (("_ops.so", "ops do not load .*_ops.so.*built against torch"),
+                        ("_core" + sysconfig.get_config_var("EXT_SUFFIX"), "_core does not load .*build it again")):
+        for file in folder.glob("_*.so"):
+            file.unlink()
+        for file in WHERE_THE_PACKAGE_LIES.glob("diff_smoe_rasterization/*.so"):
+            shutil.copy(file, folder)
+        (folder / name).write_bytes(b"not a shared library")
+        with pytest.raises(ImportError, match=words + ".*pip install"):
+            load(".extension")
+        for module in [module for module in sys.modules if module.split(".")[0] == folder.name]:
+            del sys.modules[module]
 
 
 def test_an_unknown_instruction_set_is_refused_with_those_that_there_are():
@@ -150,14 +158,14 @@ def test_build_info_tells_what_runs():
 
 def test_the_settings_and_the_op_have_the_same_fields():
     """A setting is a line of csrc/torch/fields.h and a field of this name; these options are no settings."""
-    options = set(_C.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward"}
+    options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward"}
     fields = set(GaussianRasterizationSettings._fields)
     assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
-    assert fields - options <= set(_C.inputs) and options <= fields
+    assert fields - options <= set(_core.inputs) and options <= fields
 
 
 def test_the_blend_modes_have_the_numbers_and_the_background_gates_of_the_core():
-    modes = diff_smoe_rasterization.extension._C.blend_modes
+    modes = diff_smoe_rasterization.core._core.blend_modes
     assert {name: facts["number"] for name, facts in modes.items()} == {mode: i for i, mode in enumerate(BLEND_MODES)}
     assert {name: facts["background_gate"] for name, facts in modes.items()} == _FIXED_GATES
     below = {mode: resolve_faint_below(mode, None) for mode in BLEND_MODES}
@@ -214,7 +222,7 @@ def test_radii_changed_in_place_before_backward_are_noticed(mode):
 def backward_arguments(mode, **others):
     """Returns the arguments of the op rasterize_backward by name."""
     scene = random_scene(mode, 20, 20, 18, degree=1, dtype=torch.float32)
-    tensors = op_arguments(scene)[:len(_C.inputs)]
+    tensors = op_arguments(scene)[:len(_core.inputs)]
     images, saved = op_results(scene)
     present = [tensor is not None for tensor in tensors]
     given = {"dL_d" + name: random_normal(images[name].shape, seed, torch.float32)
@@ -238,11 +246,11 @@ def test_opcheck_of_rasterize_backward(mode):
                           tuple(backward_arguments(mode).values()))
 
 
-@pytest.mark.parametrize("name", [*_C.images, *(name for name, _, _ in _C.saved["cpu"])])
+@pytest.mark.parametrize("name", [*_core.images, *(name for name, _, _ in _core.saved["cpu"])])
 def test_the_backward_op_refuses_results_that_were_cut(name):
     arguments = backward_arguments("smoe")
-    results, names = ((arguments["images"], _C.images) if name in _C.images
-                      else (arguments["saved"], [name for name, _, _ in _C.saved["cpu"]]))
+    results, names = ((arguments["images"], _core.images) if name in _core.images
+                      else (arguments["saved"], [name for name, _, _ in _core.saved["cpu"]]))
     index = list(names).index(name)
     results[index] = results[index][:-1]
     with pytest.raises(ValueError, match=rf"rasterize_backward: {name} has "):
@@ -283,7 +291,7 @@ def test_the_backward_op_refuses_absent_inputs(row, name):
 def test_the_backward_op_refuses_gradients_of_absent_inputs():
     arguments = backward_arguments("smoe")
     with pytest.raises(ValueError, match="gradient of dc is wanted, but that input is absent"):
-        call_backward({**arguments, "wanted": [True] * len(_C.inputs)})
+        call_backward({**arguments, "wanted": [True] * len(_core.inputs)})
 
 
 @on_every_device

@@ -1,153 +1,203 @@
-#include "python/io.h"
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include <array>
 #include <cstdint>
+#include <memory>
+#include <new>
 #include <optional>
+#include <stdexcept>
 #include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
 
 #include "io/colmap.h"
+#include "io/cursor.h"
 #include "io/file.h"
 #include "io/ply.h"
+#include "python/python.h"
 
-namespace dsmoe::io {
+namespace py = pybind11;
+
+namespace dsmoe {
+
+namespace python {
+
+py::str text(const std::string& utf8) {
+  return py::reinterpret_steal<py::str>(
+      PyUnicode_DecodeUTF8(utf8.data(), static_cast<Py_ssize_t>(utf8.size()), "backslashreplace"));
+}
+
+void translate_exception(std::exception_ptr exception) {
+  try {
+    std::rethrow_exception(std::move(exception));
+  } catch (const py::builtin_exception&) {  // of pybind11 itself, which translates it
+    throw;
+  } catch (const py::error_already_set&) {
+    throw;
+  } catch (const io::FileError& error) {
+    // Made here, because Python 3.8 does not turn a bare OSError into its subclass (FileNotFoundError ...) by itself.
+    const py::object made =
+        py::reinterpret_borrow<py::object>(PyExc_OSError)(error.error_number, text(error.reason), text(error.path));
+    PyErr_SetObject(py::type::handle_of(made).ptr(), made.ptr());
+  } catch (const std::bad_alloc&) {
+    PyErr_NoMemory();
+  } catch (const std::exception& error) {
+    const bool is_value_error = dynamic_cast<const io::FormatError*>(&error) != nullptr ||
+                                dynamic_cast<const std::invalid_argument*>(&error) != nullptr;
+    PyErr_SetObject(is_value_error ? PyExc_ValueError : PyExc_RuntimeError, text(error.what()).ptr());
+  }
+}
+
+}  // namespace python
+
+namespace io {
 
 namespace {
 
-using python::Array;
-using python::Dict;
-using python::List;
-using python::Object;
+using python::text;
+using Unlocked = py::gil_scoped_release;  // other threads run Python meanwhile
+
+template <class T> using Array = py::array_t<T, py::array::c_style>;
 template <class T> using OptionalArray = std::optional<Array<T>>;
 
 // Paths and names travel as bytes, since a file's name need not be UTF-8; io.py encodes and decodes them.
 
-template <typename T> Object array_or_none(std::vector<T>&& values, const std::vector<int64_t>& shape) {
-  if (values.empty() && shape[0] != 0) return python::to_python(std::nullopt);
-  return python::array(std::move(values), shape);
+// Hands a vector over to numpy without a copy.
+template <class T> py::array to_numpy(std::vector<T>&& values, const std::vector<int64_t>& shape) {
+  auto owned = std::make_unique<std::vector<T>>(std::move(values));
+  const T* data = owned->data();
+  const py::capsule owner(owned.release(), [](void* vector) { delete static_cast<std::vector<T>*>(vector); });
+  return Array<T>(shape, data, owner);
 }
 
-template <typename T> std::vector<T> or_empty(OptionalArray<T>&& array) {
-  return array ? std::move(*array) : std::vector<T>();
+template <class T> py::object to_numpy_or_none(std::vector<T>&& values, const std::vector<int64_t>& shape) {
+  if (values.empty() && shape[0] != 0) return py::none();
+  return to_numpy(std::move(values), shape);
 }
 
-Object read_gaussians_python(const std::string& path) {
+template <class T> std::vector<T> to_vector(const Array<T>& array) {
+  return std::vector<T>(array.data(), array.data() + array.size());
+}
+
+template <class T> std::vector<T> to_vector(const OptionalArray<T>& array) {
+  return array ? to_vector(*array) : std::vector<T>();
+}
+
+py::tuple to_tuple(const std::vector<std::string>& lines) {
+  py::tuple out(lines.size());
+  for (size_t i = 0; i < lines.size(); ++i) out[i] = text(lines[i]);
+  return out;
+}
+
+py::dict read_gaussians_python(const std::string& path) {
   GaussianModel model;
   {
-    const python::Unlocked unlocked;
+    const Unlocked unlocked;
     model = read_gaussians(path);
   }
   const auto n = static_cast<int64_t>(model.count);
   const int64_t rest = (model.sh_degree + 1) * (model.sh_degree + 1) - 1;
-  Dict result;
-  result.set("means3D", python::array(std::move(model.means3D), {n, 3}));
-  result.set("dc", python::array(std::move(model.dc), {n, 1, 3}));
-  result.set("shs", python::array(std::move(model.shs), {n, rest, 3}));
-  result.set("opacity_logits", python::array(std::move(model.opacity_logits), {n, 1}));
-  result.set("log_scales", python::array(std::move(model.log_scales), {n, 3}));
-  result.set("rotations", python::array(std::move(model.rotations), {n, 4}));
-  if (model.blend_mode.empty()) {
-    result.set("blend_mode", std::nullopt);
-  } else {
-    result.set("blend_mode", model.blend_mode);
-  }
-  result.set("background_gate", model.background_gate);
-  result.set("comments", python::tuple_of(model.comments));
+  py::dict result;
+  result["means3D"] = to_numpy(std::move(model.means3D), {n, 3});
+  result["dc"] = to_numpy(std::move(model.dc), {n, 1, 3});
+  result["shs"] = to_numpy(std::move(model.shs), {n, rest, 3});
+  result["opacity_logits"] = to_numpy(std::move(model.opacity_logits), {n, 1});
+  result["log_scales"] = to_numpy(std::move(model.log_scales), {n, 3});
+  result["rotations"] = to_numpy(std::move(model.rotations), {n, 4});
+  result["blend_mode"] = model.blend_mode.empty() ? py::object(py::none()) : text(model.blend_mode);
+  result["background_gate"] = model.background_gate;
+  result["comments"] = to_tuple(model.comments);
   return result;
 }
 
-void write_gaussians_python(const std::string& path, int64_t sh_degree, Array<float> means3D, Array<float> dc,
-                            Array<float> shs, Array<float> opacity_logits, Array<float> log_scales,
-                            Array<float> rotations, std::string blend_mode, std::optional<double> background_gate,
-                            std::vector<std::string> comments) {
-  GaussianModel model;
-  model.count = means3D.size() / 3;
-  model.sh_degree = static_cast<int>(sh_degree);
-  model.means3D = std::move(means3D);
-  model.dc = std::move(dc);
-  model.shs = std::move(shs);
-  model.opacity_logits = std::move(opacity_logits);
-  model.log_scales = std::move(log_scales);
-  model.rotations = std::move(rotations);
-  model.blend_mode = std::move(blend_mode);
-  model.background_gate = background_gate;
-  model.comments = std::move(comments);
-  const python::Unlocked unlocked;
+void write_gaussians_python(const std::string& path, int sh_degree, const Array<float>& means3D, const Array<float>& dc,
+                            const Array<float>& shs, const Array<float>& opacity_logits, const Array<float>& log_scales,
+                            const Array<float>& rotations, const std::string& blend_mode,
+                            std::optional<double> background_gate, const std::vector<std::string>& comments) {
+  const GaussianModel model{static_cast<size_t>(means3D.shape(0)),
+                            sh_degree,
+                            to_vector(means3D),
+                            to_vector(dc),
+                            to_vector(shs),
+                            to_vector(opacity_logits),
+                            to_vector(log_scales),
+                            to_vector(rotations),
+                            blend_mode,
+                            background_gate,
+                            comments};
+  const Unlocked unlocked;
   write_gaussians(path, model);
 }
 
-Object to_dict(PointCloud&& cloud) {
+py::dict to_dict(PointCloud&& cloud) {
   const auto n = static_cast<int64_t>(cloud.count);
-  Dict result;
-  result.set("positions", python::array(std::move(cloud.positions), {n, 3}));
-  result.set("colors", array_or_none(std::move(cloud.colors), {n, 3}));
-  result.set("normals", array_or_none(std::move(cloud.normals), {n, 3}));
-  result.set("comments", python::tuple_of(cloud.comments));
+  py::dict result;
+  result["positions"] = to_numpy(std::move(cloud.positions), {n, 3});
+  result["colors"] = to_numpy_or_none(std::move(cloud.colors), {n, 3});
+  result["normals"] = to_numpy_or_none(std::move(cloud.normals), {n, 3});
+  result["comments"] = to_tuple(cloud.comments);
   return result;
 }
 
-Object read_points_python(const std::string& path) {
+py::dict read_points_python(const std::string& path) {
   PointCloud cloud;
   {
-    const python::Unlocked unlocked;
+    const Unlocked unlocked;
     cloud = read_points(path);
   }
   return to_dict(std::move(cloud));
 }
 
-PointCloud to_cloud(Array<double>&& positions, OptionalArray<uint8_t>&& colors) {
+PointCloud to_cloud(const Array<double>& positions, const OptionalArray<uint8_t>& colors) {
   PointCloud cloud;
-  cloud.count = positions.size() / 3;
-  cloud.positions = std::move(positions);
-  cloud.colors = or_empty(std::move(colors));
+  cloud.count = static_cast<size_t>(positions.shape(0));
+  cloud.positions = to_vector(positions);
+  cloud.colors = to_vector(colors);
   return cloud;
 }
 
-void write_points_python(const std::string& path, Array<double> positions, OptionalArray<uint8_t> colors,
-                         OptionalArray<float> normals, std::vector<std::string> comments) {
-  PointCloud cloud = to_cloud(std::move(positions), std::move(colors));
-  cloud.normals = or_empty(std::move(normals));
-  cloud.comments = std::move(comments);
-  const python::Unlocked unlocked;
+void write_points_python(const std::string& path, const Array<double>& positions, const OptionalArray<uint8_t>& colors,
+                         const OptionalArray<float>& normals, const std::vector<std::string>& comments) {
+  PointCloud cloud = to_cloud(positions, colors);
+  cloud.normals = to_vector(normals);
+  cloud.comments = comments;
+  const Unlocked unlocked;
   write_points(path, cloud);
 }
 
 // A copy: these are few numbers.
-template <class Numbers> Object numbers(const Numbers& values) {
-  return python::array(std::vector<double>(values.begin(), values.end()), {static_cast<int64_t>(values.size())});
+template <class Numbers> py::array to_numpy(const Numbers& values) {
+  return to_numpy(std::vector<double>(values.begin(), values.end()), {static_cast<int64_t>(values.size())});
 }
 
-Object to_list(const std::vector<ColmapCamera>& cameras) {
-  List result;
+py::list to_list(const std::vector<ColmapCamera>& cameras) {
+  py::list result;
   for (const ColmapCamera& camera : cameras) {
-    result.append(python::tuple(camera.id, camera.model->name, camera.width, camera.height, numbers(camera.params)));
+    result.append(py::make_tuple(camera.id, camera.model->name, camera.width, camera.height, to_numpy(camera.params)));
   }
   return result;
 }
 
-Object find_colmap_folder_python(const std::string& folder) { return python::bytes(find_colmap_folder(folder)); }
-
-Object read_colmap_cameras_python(const std::string& path) { return to_list(read_colmap_cameras(path)); }
-
-Object read_colmap_python(const std::string& folder) {
+py::dict read_colmap_python(const std::string& folder) {
   ColmapModel model;
   {
-    const python::Unlocked unlocked;
+    const Unlocked unlocked;
     model = read_colmap(folder);
   }
-  List images;
+  py::list images;
   for (const ColmapImage& image : model.images) {
     images.append(
-        python::tuple(image.id, python::bytes(image.name), image.camera_id, numbers(image.qvec), numbers(image.tvec)));
+        py::make_tuple(image.id, py::bytes(image.name), image.camera_id, to_numpy(image.qvec), to_numpy(image.tvec)));
   }
   const auto n = static_cast<int64_t>(model.points.cloud.count);
-  Dict result;
-  result.set("cameras", to_list(model.cameras));
-  result.set("images", Object(images));
-  result.set("point_errors", python::array(std::move(model.points.errors), {n}));
-  result.set("points", to_dict(std::move(model.points.cloud)));
+  py::dict result;
+  result["cameras"] = to_list(model.cameras);
+  result["images"] = images;
+  result["point_errors"] = to_numpy(std::move(model.points.errors), {n});
+  result["points"] = to_dict(std::move(model.points.cloud));
   return result;
 }
 
@@ -155,8 +205,9 @@ using CameraTuple = std::tuple<std::uint32_t, std::string, std::uint64_t, std::u
 using ImageTuple = std::tuple<std::uint32_t, std::string, std::uint32_t, std::array<double, 4>, std::array<double, 3>>;
 
 void write_colmap_python(const std::string& folder, const std::vector<CameraTuple>& cameras,
-                         const std::vector<ImageTuple>& images, Array<double> positions, OptionalArray<uint8_t> colors,
-                         OptionalArray<double> point_errors, bool text) {
+                         const std::vector<ImageTuple>& images, const Array<double>& positions,
+                         const OptionalArray<uint8_t>& colors, const OptionalArray<double>& point_errors,
+                         bool as_text) {
   ColmapModel model;
   for (const auto& [id, name, width, height, params] : cameras) {
     const CameraModel* camera_model = find_camera_model(name);
@@ -167,26 +218,25 @@ void write_colmap_python(const std::string& folder, const std::vector<CameraTupl
   }
   for (const auto& [id, name, camera_id, qvec, tvec] : images)
     model.images.push_back({id, qvec, tvec, camera_id, name});
-  model.points.cloud = to_cloud(std::move(positions), std::move(colors));
-  model.points.errors = or_empty(std::move(point_errors));
-  const python::Unlocked unlocked;
-  write_colmap(folder, model, text ? ColmapFormat::kText : ColmapFormat::kBinary);
+  model.points.cloud = to_cloud(positions, colors);
+  model.points.errors = to_vector(point_errors);
+  const Unlocked unlocked;
+  write_colmap(folder, model, as_text ? ColmapFormat::kText : ColmapFormat::kBinary);
 }
-
-PyMethodDef methods[] = {python::method<&read_gaussians_python>("read_gaussians"),
-                         python::method<&write_gaussians_python>("write_gaussians"),
-                         python::method<&read_points_python>("read_points"),
-                         python::method<&write_points_python>("write_points"),
-                         python::method<&find_colmap_folder_python>("find_colmap_folder"),
-                         python::method<&read_colmap_python>("read_colmap"),
-                         python::method<&read_colmap_cameras_python>("read_colmap_cameras"),
-                         python::method<&write_colmap_python>("write_colmap"),
-                         {nullptr, nullptr, 0, nullptr}};
-
-PyModuleDef definition = {PyModuleDef_HEAD_INIT, "io", nullptr, -1, methods, nullptr, nullptr, nullptr, nullptr};
 
 }  // namespace
 
-python::Object make_module() { return Object(PyModule_Create(&definition)); }
+void add_to(py::module_ module) {
+  module.def("read_gaussians", &read_gaussians_python);
+  module.def("write_gaussians", &write_gaussians_python);
+  module.def("read_points", &read_points_python);
+  module.def("write_points", &write_points_python);
+  module.def("find_colmap_folder", [](const std::string& folder) { return py::bytes(find_colmap_folder(folder)); });
+  module.def("read_colmap", &read_colmap_python);
+  module.def("read_colmap_cameras", [](const std::string& path) { return to_list(read_colmap_cameras(path)); });
+  module.def("write_colmap", &write_colmap_python);
+}
 
-}  // namespace dsmoe::io
+}  // namespace io
+
+}  // namespace dsmoe

@@ -1,150 +1,138 @@
-// The Python module: what is no tensor op. Importing it registers the ops (schema.cpp).
+// The Python module _core: what is no tensor op. It needs Python and numpy, but no torch.
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include "dsmoe/allocator.h"
+#include "dsmoe/arrays.h"
 #include "dsmoe/blend.h"
 #include "dsmoe/constants.h"
+#include "dsmoe/rasterize.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "dsmoe/removal.h"
-#include "python/io.h"
+#include "process.h"
 #include "python/python.h"
-#include "torch/most_instances.h"
-#include "torch/profiling.h"
-#include "torch/tensors.h"
+#include "torch/fields.h"
 
-#ifdef DSMOE_STABLE_ABI
-#include <torch/headeronly/version.h>
-#else
-#include <torch/version.h>
-#endif
+namespace py = pybind11;
 
 namespace {
 
 using namespace dsmoe;
-using python::Dict;
-using python::Object;
 
 // For the test that compares them with the oracle's own.
-Object constants() {
-  return Dict()
-      .set("alpha_max", kAlphaMax)
-      .set("alpha_cut", kAlphaCut)
-      .set("gate_cut", kGateCut)
-      .set("core_kernel", kCoreKernel)
-      .set("transmittance_cut", kTransmittanceCut)
-      .set("gate_sum_cut", kGateSumCut)
-      .set("max_opacity", kMaxOpacity)
-      .set("radius_root_floor", kRadiusRootFloor)
-      .set("compensation_floor", kCompensationFloor)
-      .set("low_pass", kLowPass)
-      .set("frustum_margin", kFrustumMargin)
-      .set("homogeneous_epsilon", kHomogeneousEpsilon)
-      .set("tile_size", kTileSize)
-      .set("segment_length", cuda::kSegmentLength);
+py::dict constants() {
+  py::dict out;
+  out["alpha_max"] = kAlphaMax;
+  out["alpha_cut"] = kAlphaCut;
+  out["gate_cut"] = kGateCut;
+  out["core_kernel"] = kCoreKernel;
+  out["transmittance_cut"] = kTransmittanceCut;
+  out["gate_sum_cut"] = kGateSumCut;
+  out["max_opacity"] = kMaxOpacity;
+  out["radius_root_floor"] = kRadiusRootFloor;
+  out["compensation_floor"] = kCompensationFloor;
+  out["low_pass"] = kLowPass;
+  out["frustum_margin"] = kFrustumMargin;
+  out["homogeneous_epsilon"] = kHomogeneousEpsilon;
+  out["tile_size"] = kTileSize;
+  out["segment_length"] = cuda::kSegmentLength;
+  return out;
 }
 
-// The list of fields.h: the options' names in the order of the ops' arguments, with their types.
-Object options() {
-  Dict types;
-#define DSMOE_TYPE(type, schema, name) types.set(#name, schema);
+// The lists of fields.h: names of the ops' tensors and images, in order; of the options also the types.
+#define DSMOE_NAME_OF_INPUT(enumerator, schema, name, ...) #name,
+#define DSMOE_NAME_OF_IMAGE(enumerator, name) #name,
+py::tuple inputs() { return py::tuple(py::cast(std::vector<std::string>{DSMOE_INPUTS(DSMOE_NAME_OF_INPUT)})); }
+py::tuple images() { return py::tuple(py::cast(std::vector<std::string>{DSMOE_IMAGES(DSMOE_NAME_OF_IMAGE)})); }
+
+py::dict options() {
+  py::dict types;
+#define DSMOE_TYPE(type, schema, name) types[#name] = schema;
   DSMOE_OPTIONS(DSMOE_TYPE)
-#undef DSMOE_TYPE
   return types;
 }
 
 // What a backend saves: of each tensor its name, its type ("real": that of the inputs) and how many numbers a row has.
-template <class Saved, class Sizes> Object saved_arrays() {
-  python::List arrays;
+template <class Saved, class Sizes> py::list saved_arrays() {
+  py::list arrays;
   Saved saved;
   for_each_array(saved, Sizes(), [&](const char* name, auto*& pointer, int64_t rows) {
     const SavedArray array = saved_array(name, pointer, rows);
     const char* type = array.type == NumberType::kInt32 ? "int32" : array.type == NumberType::kInt64 ? "int64" : "real";
-    arrays.append(python::tuple(name, type, array.columns));
+    arrays.append(py::make_tuple(name, type, array.columns));
   });
   return arrays;
 }
 
-Object saved() {
-  return Dict()
-      .set("cpu", saved_arrays<SavedForward<float>, SavedSizes>())
-      .set("cuda", saved_arrays<cuda::SavedForward<float>, cuda::SavedSizes>());
+py::dict saved() {
+  py::dict backends;
+  backends["cpu"] = saved_arrays<SavedForward<float>, SavedSizes>();
+  backends["cuda"] = saved_arrays<cuda::SavedForward<float>, cuda::SavedSizes>();
+  return backends;
 }
 
 // The core's list: names in the order of their numbers, each with the facts that Python asks for. `divides`: the
 // backward pass reads the images of the forward pass. `removable`: `importance` takes the mode. `background_gate`: the
 // mode's own, or None where the caller gives it. `faint_below`: what is usual in the mode.
-Object blend_modes() {
-  Dict modes;
+py::dict blend_modes() {
+  py::dict modes;
   BlendModes::for_each([&](auto mode) {
     using Policy = Blend<decltype(mode)::value>;
     std::optional<double> gate;
     if constexpr (!Policy::kLearnsGate) gate = Policy::background_gate(0.0);
-    modes.set(Policy::kName, Object(Dict()
-                                        .set("number", static_cast<int>(decltype(mode)::value))
-                                        .set("divides", Policy::kDivides)
-                                        .set("removable", kRemovable<decltype(mode)::value>)
-                                        .set("background_gate", gate)
-                                        .set("tails", Policy::kTails)
-                                        .set("faint_below", Policy::kFaintBelow)));
+    py::dict facts;
+    facts["number"] = static_cast<int>(decltype(mode)::value);
+    facts["divides"] = Policy::kDivides;
+    facts["removable"] = kRemovable<decltype(mode)::value>;
+    facts["background_gate"] = gate;
+    facts["tails"] = Policy::kTails;
+    facts["faint_below"] = Policy::kFaintBelow;
+    modes[Policy::kName] = facts;
   });
   return modes;
 }
 
-Object build_info() {
+// Raises ValueError where DSMOE_SIMD names no level of this processor.
+py::dict build_info() {
 #ifdef DSMOE_WITH_CUDA
   constexpr bool kCudaBuilt = true;
 #else
   constexpr bool kCudaBuilt = false;
 #endif
-  return Dict()
-      .set("torch_built_with", TORCH_VERSION)
-      .set("compiler", __VERSION__)
-      .set("cuda_built", kCudaBuilt)
-      .set("simd_level", cpu::simd_level())
-      .set("num_threads", binding::num_threads());
+  py::dict info;
+  info["compiler"] = __VERSION__;
+  info["cuda_built"] = kCudaBuilt;
+  info["simd_level"] = cpu::simd_level();
+  return info;
 }
 
-Object stage_times() {
+py::dict stage_times() {
   const StageTimes times = binding::stage_times();
-  return Dict()
-      .set("project", times.project)
-      .set("sort", times.sort)
-      .set("bin", times.bin)
-      .set("blend", times.blend)
-      .set("blend_backward", times.blend_backward)
-      .set("project_backward", times.project_backward)
-      .set("forward_pairs", times.forward_pairs)
-      .set("backward_pairs", times.backward_pairs);
+  py::dict out;
+  out["project"] = times.project;
+  out["sort"] = times.sort;
+  out["bin"] = times.bin;
+  out["blend"] = times.blend;
+  out["blend_backward"] = times.blend_backward;
+  out["project_backward"] = times.project_backward;
+  out["forward_pairs"] = times.forward_pairs;
+  out["backward_pairs"] = times.backward_pairs;
+  return out;
 }
-
-void add(PyObject* module, const char* name, Object value) {
-  python::check_status(PyModule_AddObject(module, name, value.get()));
-  value.release();  // which the module has now
-}
-
-PyMethodDef methods[] = {python::method<&build_info>("build_info"),
-                         python::method<&binding::set_most_instances>("set_most_instances"),
-                         python::method<&binding::set_profiling>("set_profiling"),
-                         python::method<&stage_times>("stage_times"),
-                         {nullptr, nullptr, 0, nullptr}};
-
-PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_C", nullptr, -1, methods, nullptr, nullptr, nullptr, nullptr};
 
 }  // namespace
 
-PyMODINIT_FUNC PyInit__C() {
-  try {
-#ifdef DSMOE_STABLE_ABI
-    binding::prepare_python_errors();
-#endif
-    Object module(PyModule_Create(&definition));
-    add(module.get(), "constants", constants());
-    add(module.get(), "blend_modes", blend_modes());
-    add(module.get(), "inputs", python::tuple_of(binding::kInputNames));
-    add(module.get(), "images", python::tuple_of(binding::kImageNames));
-    add(module.get(), "options", options());
-    add(module.get(), "saved", saved());
-    add(module.get(), "io", io::make_module());
-    return module.release();
-  } catch (...) {
-    python::set_error();
-    return nullptr;
-  }
+PYBIND11_MODULE(_core, module) {
+  py::register_exception_translator(&python::translate_exception);
+  module.attr("constants") = constants();
+  module.attr("blend_modes") = blend_modes();
+  module.attr("inputs") = inputs();
+  module.attr("images") = images();
+  module.attr("options") = options();
+  module.attr("saved") = saved();
+  module.def("build_info", &build_info);
+  module.def("set_most_instances", &binding::set_most_instances);
+  module.def("set_profiling", &binding::set_profiling);
+  module.def("stage_times", &stage_times);
+  io::add_to(module.def_submodule("io"));
 }

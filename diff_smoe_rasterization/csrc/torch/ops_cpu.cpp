@@ -2,7 +2,7 @@
 #include <cstring>
 
 #include "ops.h"
-#include "profiling.h"
+#include "process.h"
 
 namespace dsmoe {
 namespace binding {

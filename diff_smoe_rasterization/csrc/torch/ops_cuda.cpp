@@ -2,7 +2,7 @@
 #include "cuda_stream.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "ops.h"
-#include "profiling.h"
+#include "process.h"
 
 namespace dsmoe {
 namespace binding {

@@ -1,8 +1,14 @@
 #include "python_errors.h"
 
-#include <stdexcept>
+// Of Python's limited API, so that one binary serves every release from 3.8 on.
+#define PY_SSIZE_T_CLEAN
+#include <pyconfig.h>
+#if !defined(Py_LIMITED_API) && !defined(Py_GIL_DISABLED)  // the free-threaded Python has no limited API
+#define Py_LIMITED_API 0x03080000
+#endif
+#include <Python.h>
 
-#include "python/python.h"
+#include <stdexcept>
 
 // PyTorch's Python side calls ops through pybind11. That turns an exception of its class `builtin_exception` into the
 // error that the virtual function sets, here one of a subclass. Declared as pybind11 has it since 2.0: C++ matches
@@ -30,11 +36,11 @@ class PythonError final : public pybind11::builtin_exception {
       PyErr_SetString(type(), what());
       return;
     }
-    try {
-      const python::Object type = python::attribute(python::import("torch"), "OutOfMemoryError");
-      PyErr_SetString(type.get(), what());
-    } catch (const python::ErrorIsSet&) {
-    }
+    PyObject* const torch = PyImport_ImportModule("torch");
+    PyObject* const type = torch == nullptr ? nullptr : PyObject_GetAttrString(torch, "OutOfMemoryError");
+    if (type != nullptr) PyErr_SetString(type, what());
+    Py_XDECREF(type);
+    Py_XDECREF(torch);
   }
 
  private:
@@ -56,8 +62,6 @@ class PythonError final : public pybind11::builtin_exception {
   const ErrorKind kind_;
 };
 
-PyObject* forward_ad = nullptr;  // the module; kept for ever, as _C is
-
 class Locked {
  public:
   Locked() : state_(PyGILState_Ensure()) {}
@@ -73,13 +77,11 @@ class Locked {
 
 void raise(ErrorKind kind, const std::string& message) { throw PythonError(kind, message); }
 
-void prepare_python_errors() {
-  if (forward_ad == nullptr) forward_ad = python::import("torch.autograd.forward_ad").release();
-}
-
 bool forward_mode_is_open() {
   const Locked lock;
-  PyObject* const level = PyObject_GetAttrString(forward_ad, "_current_level");
+  static PyObject* forward_ad = nullptr;  // the module, kept for ever
+  if (forward_ad == nullptr) forward_ad = PyImport_ImportModule("torch.autograd.forward_ad");
+  PyObject* const level = forward_ad == nullptr ? nullptr : PyObject_GetAttrString(forward_ad, "_current_level");
   const long value = level == nullptr ? 0 : PyLong_AsLong(level);
   Py_XDECREF(level);
   if (PyErr_Occurred() == nullptr) return value >= 0;

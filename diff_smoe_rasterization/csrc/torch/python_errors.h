@@ -1,5 +1,5 @@
 // What an op asks of Python where LibTorch's stable ABI has no form of it: to raise an error of a type, and whether a
-// level of forward-mode derivatives is open. python_errors.cpp is part of the module _C.
+// level of forward-mode derivatives is open. Its functions are found in the Python that loads the ops.
 #pragma once
 
 #include <string>
@@ -11,9 +11,6 @@ enum class ErrorKind { kRuntime, kValue, kType, kIndex, kNotImplemented, kOutOfM
 
 // Throws what PyTorch turns into a Python error of that kind. Needs no GIL.
 [[noreturn]] void raise(ErrorKind kind, const std::string& message);
-
-// Called once, when the module is imported.
-void prepare_python_errors();
 
 // Whether torch.autograd.forward_ad has a level open.
 bool forward_mode_is_open();

@@ -9,7 +9,7 @@
 
 #include "dsmoe/rasterize.h"
 #include "fields.h"
-#include "most_instances.h"
+#include "process.h"
 #include "tensor.h"
 
 namespace dsmoe {

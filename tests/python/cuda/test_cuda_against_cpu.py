@@ -18,7 +18,7 @@ from scenes import (
 )
 
 from diff_smoe_rasterization import rasterize, reference
-from diff_smoe_rasterization.extension import _C
+from diff_smoe_rasterization.core import _core
 from diff_smoe_rasterization.settings import OUTPUTS
 from dsmoe.config import TrainConfig
 from dsmoe.model import GaussianModel
@@ -198,7 +198,7 @@ def test_lists_of_several_segments(mode, name, gpu):
     """Of float and three features, so that a warp of the backward pass has a part of a list; some tiles are partial."""
     scene = LONG_LISTS[name](mode)
     offsets = op_results(scene.to(torch.float32).to(gpu))[1]["tile_offsets"]
-    assert (offsets[1:-1] - offsets[:-2]).max() > 2 * _C.constants["segment_length"]
+    assert (offsets[1:-1] - offsets[:-2]).max() > 2 * _core.constants["segment_length"]
     # Sums of a thousand terms and more, in another order. Of 1480 pixels with a thousand pairs of alpha near 1/255
     # each, a few have one that lies within rounding, 1e-6 of itself, of that threshold.
     rendering = compare(scene, gpu, torch.float32, ("depth", "inverse_depth") if "depths" in name else (),
@@ -220,8 +220,8 @@ def test_renderings_without_gradients_keep_no_segments(mode, gpu):
     for image in (lean[0]["color"], rendering.color):
         assert torch.equal(image, kept[0]["color"])
 
-    inputs = {name: value for name, value in zip(_C.inputs, op_arguments(scene)) if value is not None}
-    present = [name in inputs for name in _C.inputs]
+    inputs = {name: value for name, value in zip(_core.inputs, op_arguments(scene)) if value is not None}
+    present = [name in inputs for name in _core.inputs]
     gradient = torch.randn(kept[0]["color"].shape, generator=torch.Generator().manual_seed(1)).to(gpu)
     first, second = (torch.ops.diff_smoe_rasterization.rasterize_backward(
         *op_arguments(scene, "rasterize_backward", **colour_alone, dL_dcolor=gradient, inputs=list(inputs.values()),

@@ -1,11 +1,19 @@
-// The stage times of the latest rendering and of the latest backward pass. They are taken while profiling is on.
+// What callers set for the whole process: the clock of the stages, and how many tile instances a pass lists at once.
 #pragma once
+
+#include <cstdint>
 
 #include "dsmoe/rasterize.h"
 
 namespace dsmoe {
 namespace binding {
 
+// Tests make it small, so that a small image is rendered in many bands; 0: kMostInstances. Throws std::invalid_argument
+// below 0.
+void set_most_instances(int64_t count);
+int64_t most_instances();
+
+// Whether stage times are taken.
 void set_profiling(bool enabled);
 
 // Of the latest forward pass, and of the latest backward pass; zeros where there was none.

@@ -1,0 +1,36 @@
+"""The compiled core `_core`, or why it does not load: files, constants and the facts of the blend modes; no torch."""
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any, NoReturn, Optional
+
+BUILD = "in the source folder type: pip install --no-build-isolation -e ."
+
+
+def recorded(name: str) -> Optional[str]:
+    """Returns what the build wrote down under this name, readable even where the extension cannot be loaded."""
+    try:
+        return getattr(importlib.import_module("._build_info", __package__), name, None)
+    except ImportError:
+        return None
+
+
+def fail(reason: str, cause: Optional[BaseException] = None) -> NoReturn:
+    """Raises the ImportError that says why this package does not work."""
+    raise ImportError(f"diff_smoe_rasterization: {reason}") from cause
+
+
+def _load() -> Any:
+    try:
+        return importlib.import_module("._core", __package__)
+    except ModuleNotFoundError as error:
+        if error.name != f"{__package__}._core":
+            raise
+        folder = os.path.dirname(os.path.abspath(__file__))
+        fail(f"its extension _core is not built for this Python in {folder}; {BUILD}", error)
+    except ImportError as error:
+        fail(f"its extension _core does not load ({error}); build it again, {BUILD}", error)
+
+
+_core = _load()
