@@ -204,6 +204,30 @@ def test_what_cannot_be_read_is_not_called_missing(trained, scene, tmp_path, cap
     assert "checkpoint.pt: cannot be read" in fails(capsys, "train", "--resume", "-o", resumed)
 
 
+def test_train_writes_into_no_folder_of_others(scene, tmp_path, capsys):
+    photographs = tmp_path / "photos"
+    shutil.copytree(os.path.join(scene, "images"), str(photographs))
+    before = {path.name: path.read_bytes() for path in photographs.iterdir()}
+    words = ["train", scene, "-o", str(photographs), *SHORT]
+    text = fails(capsys, *words)
+    assert f"{photographs} is not empty (view_000.png), and nothing says that dsmoe train wrote it" in text
+    assert "choose a new or empty folder with -o; --overwrite trains beside what is there" in text
+    assert "is not empty (view_000.png)" in fails(capsys, *words, "--resume")
+    assert before == {path.name: path.read_bytes() for path in photographs.iterdir()}
+    assert main([*words, "--overwrite"]) == 0
+    assert main([*words, "--overwrite"]) == 0 and main([*words, "--resume"]) == 0
+    assert before == {name: (photographs / name).read_bytes() for name in before}
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    for name in (".dsmoe.lock", f".dsmoe_part-{ended.pid}-.dsmoe.json"):
+        (killed / name).write_text("")
+    for command in (["train", scene, *SHORT], ["render", str(photographs)]):
+        folder = shutil.copytree(killed, tmp_path / command[0])
+        assert main([*command, "-o", str(folder)]) == 0, "what a run leaves that is killed at once is in nobody's way"
+
+
 def test_render_writes_into_its_own_folder_alone(trained, scene, tmp_path, capsys):
     photographs = tmp_path / "scene" / "images"
     shutil.copytree(os.path.join(scene, "images"), str(photographs))
