@@ -78,8 +78,7 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
                   rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
     """A renderer for a .ply with the blend mode and the background gate that it records.
 
-    config gives background and antialiasing. A mode that has another name now is told on stderr. Raises TrainerError
-    where what is asked disagrees with the file.
+    config gives background and antialiasing. Raises TrainerError where what is asked disagrees with the file.
     """
     model, recorded = load_model(ply, device)
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
