@@ -152,6 +152,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
 def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) -> None:
     from .results.modelfile import model_path
     from .results.rows import blend_name, results_table, viewer_warning
+    from .short_run import short_flags
     from .system.device import device_line
     from .system.process import command
     from .train import train
@@ -172,6 +173,8 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if config.strategy == "importance" and 4 * config.densify_until_iter >= 3 * config.iterations:
         print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
               "quarters of --iterations it does, and --scale-recipe makes it half of them")
+    if config.device == "cpu" and config.iterations >= TrainConfig.iterations and not arguments.resume:
+        print(f"note: {config.iterations} iterations take hours on a processor; {short_flags()} takes minutes")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
                 say=lambda text: print(text, flush=True))
     print(results_table([row]))
@@ -206,11 +209,14 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
 
 def _scene(arguments: argparse.Namespace) -> None:
     from .photos import make_scene
-    from .system.process import command
+    from .short_run import train_command
+    from .system.device import device_to_train_on
 
-    print(make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
-                     not arguments.quiet, say=lambda text: print(text, flush=True)))
-    print(f"to train on it: {command()} train {shlex.quote(arguments.output)} -o MODEL")
+    device = device_to_train_on()
+    made = make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
+                      not arguments.quiet, say=lambda text: print(text, flush=True))
+    print(made)
+    print(f"to train on it: {train_command(arguments.output, 'MODEL', device, *made.size)}")
 
 
 def _eval(arguments: argparse.Namespace) -> None:
