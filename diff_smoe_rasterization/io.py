@@ -117,7 +117,8 @@ def write_gaussians(path: PathLike, gaussians: Gaussians) -> None:
         "rotations": (count, 4),
     }
     arrays = [_array("write_gaussians", name, getattr(g, name), np.float32, shape) for name, shape in shapes.items()]
-    _io().write_gaussians(os.fsencode(path), sh_degree, *arrays, g.blend_mode or "", g.background_gate, list(g.comments))
+    _io().write_gaussians(os.fsencode(path), sh_degree, *arrays, g.blend_mode or "", g.background_gate,
+                          list(g.comments))
 
 
 def read_points(path: PathLike) -> Points:

@@ -152,7 +152,6 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
 def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) -> None:
     from .results.modelfile import model_path
     from .results.rows import blend_name, results_table, viewer_warning
-    from .short_run import short_flags
     from .system.device import device_line
     from .system.process import command
     from .train import train
@@ -173,8 +172,6 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if config.strategy == "importance" and 4 * config.densify_until_iter >= 3 * config.iterations:
         print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
               "quarters of --iterations it does, and --scale-recipe makes it half of them")
-    if config.device == "cpu" and config.iterations >= TrainConfig.iterations and not arguments.resume:
-        print(f"note: {config.iterations} iterations take hours on a processor; {short_flags()} takes minutes")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
                 say=lambda text: print(text, flush=True))
     print(results_table([row]))

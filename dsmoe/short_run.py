@@ -23,7 +23,9 @@ MOST_PIXELS = 240_000  # of an image in a hint: 4 for 1,600 pixels of width, 8 f
 
 def short_flags(width: int = 0, height: int = 0) -> str:
     """The options of `dsmoe train` for minutes on a processor, for images of that size, else for usual ones."""
-    divisor = next(n for n in (1, 2, 4, 8) if n == 8 or width * height <= MOST_PIXELS * n * n) if width else USUAL_DIVISOR
+    divisor = USUAL_DIVISOR
+    if width:
+        divisor = next((n for n in (1, 2, 4) if width * height <= MOST_PIXELS * n * n), 8)
     return FLAGS if divisor == 1 else f"{FLAGS} --resolution {divisor}"
 
 
