@@ -1,7 +1,7 @@
 """The compiled extension: what it says when it cannot be loaded, and what its ops refuse when called directly."""
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
 import re
 import shutil
@@ -10,10 +10,12 @@ import sys
 import sysconfig
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
+from PIL import Image
 from scenes import op_arguments, op_results, random_scene, with_gate
 
 import diff_smoe_rasterization
@@ -53,7 +55,7 @@ def test_a_package_that_was_not_built_says_what_to_type(copied_package):
         with pytest.raises(ImportError, match="not built.*pip install"):
             getattr(package, name)
     with pytest.raises(ImportError, match="not built.*pip install"):
-        copied_package[1](".io")
+        copied_package[1](".io").read_points("points.ply")
 
 
 def test_settings_and_reference_work_where_nothing_was_built(copied_package):
@@ -103,6 +105,21 @@ def test_the_command_says_in_one_line_that_nothing_was_built(copied_package):
     train = run("train", "scene", "-o", "out", "--blend-mode", "smoe")
     assert train.returncode == 1
     assert re.fullmatch("dsmoe train: error: .*not built.*pip install.*\n", train.stderr)
+    # What computes nothing works without it.
+    checkout = shutil.copytree(Path(__file__).parent / "patches" / "trainer", folder.parent / "trainer")
+    for action in ("check", "apply", "revert"):
+        patch = run("patch", action, checkout)
+        assert patch.returncode == 0, patch.stderr
+    (folder.parent / "other" / "gaussian_renderer").mkdir(parents=True)
+    (folder.parent / "other" / "gaussian_renderer" / "__init__.py").write_text(
+        "from gsplat import rasterization\nrasterization(means=1, rays=None, quality=2)\n")
+    assert "gsplat's rasterization with quality, which" in run("patch", "check", folder.parent / "other").stdout
+    random = np.random.RandomState(0)
+    for index in range(4):
+        Image.fromarray(random.randint(0, 255, (60, 80, 3), np.uint8)).save(folder.parent / f"{index}.png")
+    scene = run("scene", folder.parent, "-o", folder.parent / "scene")
+    reached = "of 4 photographs connect" if importlib.util.find_spec("pycolmap") else r"install pycolmap$"
+    assert scene.returncode == 1 and re.search(reached, scene.stderr, re.MULTILINE), scene.stderr
 
 
 def test_a_build_against_another_torch_names_both_and_says_what_to_type(copied_package):
