@@ -16,7 +16,7 @@ from .state_check import Misfit
 TENSOR = "__tensor__"  # marks where a tensor was
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
-FORMAT = 5  # raised when the content changes so that older files cannot be resumed
+FORMAT = 6  # raised when the content changes so that older files cannot be resumed
 
 
 def save_checkpoint(path: str, state: Dict[str, Any]) -> None:

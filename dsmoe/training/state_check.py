@@ -45,6 +45,14 @@ def check_state(state: Dict[str, Any], config: TrainConfig, strategy: Dict[str, 
     if state["gate"] is not None and state["gate"]["adam"]:
         _check_adam("gate/adam", state["gate"]["adam"], (1,))
 
+    average = state["average"]
+    if average:
+        gate = {"background_gate"} if config.background_gate == LEARNED else set()
+        _require(set(average) == {*PARAMETERS, *gate}, "average", sorted(average), f"{', '.join(PARAMETERS)}"
+                 f"{', background_gate' if gate else ''}, or nothing")
+        for name, tensor in average.items():
+            _check_tensor(f"average/{name}", tensor, shapes.get(name, (1,)))
+
     _require(set(state["strategy"]) == set(strategy), "strategy", sorted(state["strategy"]), str(sorted(strategy)))
     for name, now in strategy.items():
         value = state["strategy"][name]
