@@ -6,8 +6,10 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 """
 from __future__ import annotations
 
+import math
 from typing import Any, Dict, Optional, Tuple
 
+import numpy as np
 import torch
 
 from diff_smoe_rasterization.images import as_float
@@ -34,6 +36,9 @@ TERMS = 100  # in densify_until_iter, at least, where that has so many steps
 
 # A view needs a Gaussian if its removal costs more than this there: squared colours, summed over pixels.
 NEEDED_COST = 1e-3
+
+NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
+ROWS_AT_ONCE = 2 ** 16  # whose distances to all cameras are in memory
 
 # Growth beyond this many, or beyond twice the budget where that is more, would cost time and memory: no budget above
 # 200,000 was tried with more.
@@ -68,6 +73,7 @@ class ImportanceStrategy(SteadyStrategy):
         self.average_begins = round(AVERAGE_BEGINS * until)
         self.between_terms = max(1, min(MOST_BETWEEN_TERMS, until // TERMS))
         self.average_span = self.options.average * until  # steps
+        self._find_free_space()
         self._check_reach()
 
     def _check_reach(self) -> None:
@@ -81,6 +87,24 @@ class ImportanceStrategy(SteadyStrategy):
                               "points reach with one densification each --densification-interval "
                               f"{config.densification_interval} between --densify-from-iter "
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
+
+    def _find_free_space(self) -> None:
+        """Around each training camera is a ball in which nothing can be, as the points of the scene begin behind it."""
+        points = self.context.model.raw["means3D"].detach()
+        nearest = max(1, int(NEAREST_POINTS * len(points)))
+        centers = np.stack([view.camera.center for view in self.context.views])
+        self.cameras = torch.tensor(centers, dtype=points.dtype, device=points.device)  # [views, 3]
+        begins = [(points - camera).norm(dim=1).kthvalue(nearest).values for camera in self.cameras]
+        self.free_radii = self.options.near * torch.stack(begins)  # [views] world units
+
+    def is_near(self) -> torch.Tensor:
+        """[N] which Gaussians float in front of a training camera.
+
+        They are haze that changes the training views a little, and covers a test view whose camera is closer to them.
+        """
+        parts = self.context.model.raw["means3D"].detach().split(ROWS_AT_ONCE)
+        return torch.cat([((part[:, None] - self.cameras).square().sum(2) < self.free_radii.square()).any(1)
+                          for part in parts])
 
     def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         if iteration <= self.moves_end or self.options.squares == 0:
@@ -132,25 +156,33 @@ class ImportanceStrategy(SteadyStrategy):
         return max(min(wanted, max(2 * budget, MOST_OVERSHOOT)), 2 * self.start)
 
     def remove(self, steps_left: int) -> None:
-        """Removes the cheapest, first of what few views need, down to the budget in steps of equal ratios. steps_left: with this one."""
+        """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one.
+
+        First go those that float in front of a camera, then those that few views need.
+        """
         model, budget = self.context.model, self.context.config.budget
         if model.num_gaussians <= budget:
             return
         ratio = model.num_gaussians / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
         self._look_at_the_rest()
-        few = self.needed < min(self.options.needs, self.looks)
+        few = self.needed * len(self.context.views) < self.options.needs * self.looks
+        scores = torch.where(few, -1 / self.costs, self.costs).masked_fill(self.is_near(), -math.inf)
         mask = torch.zeros_like(few)
-        mask[torch.topk(torch.where(few, -1 / self.costs, self.costs), kept).indices] = True
+        mask[torch.topk(scores, kept).indices] = True
         self.context.optimizer.keep(mask)
         self._forget_statistics()
 
     def move(self) -> None:
-        """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
+        """Moves the cheapest Gaussians to others, drawn by their error, which are split there.
+
+        Those that float in front of a camera count as free of cost, and no other moves there.
+        """
         self._look_at_the_rest()
         count = int(self.options.moves * len(self.costs))
-        costs, sources = torch.topk(self.costs, count, largest=False)
-        errors = self.errors
+        near = self.is_near()
+        costs, sources = torch.topk(self.costs.masked_fill(near, 0), count, largest=False)
+        errors = self.errors.masked_fill(near, 0)
         self._forget_looks()
         errors[sources] = 0
         count = min(count, int((errors > 0).sum()))

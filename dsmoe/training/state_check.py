@@ -46,6 +46,7 @@ def check_state(state: Dict[str, Any], config: TrainConfig, strategy: Dict[str, 
         _check_adam("gate/adam", state["gate"]["adam"], (1,))
 
     average = state["average"]
+    _require(isinstance(average, dict), "average", average, "tensors by name, or none")
     if average:
         gate = {"background_gate"} if config.background_gate == LEARNED else set()
         _require(set(average) == {*PARAMETERS, *gate}, "average", sorted(average), f"{', '.join(PARAMETERS)}"

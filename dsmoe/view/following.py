@@ -75,9 +75,12 @@ class Followed:
     def _take_checkpoint(self, config: TrainConfig) -> None:
         device = self._arguments[-1]
         state = load_checkpoint(os.path.join(config.output, CHECKPOINT_NAME), device)
-        model = GaussianModel(state["raw"], config.sh_degree)
+        average = state["average"]
+        model = GaussianModel(average or state["raw"], config.sh_degree)
         model.active_sh_degree = state["active_sh_degree"]
-        if config.background_gate == LEARNED:
+        if "background_gate" in average:
+            gate = float(average["background_gate"])
+        elif config.background_gate == LEARNED:
             learned = LearnedGate(config, device)
             learned.load_state_dict(state["gate"])
             gate = float(learned.value)

@@ -530,6 +530,7 @@ ALTERATIONS = [
     ("strategy/gradient_sum", lambda rows: torch.stack([rows, rows], -1)[..., 0]),
     ("optimizer/dc/exp_avg", lambda rows: rows[:1].expand_as(rows)), ("strategy/gradient_sum", lambda rows: rows.int()),
     ("strategy/gradient_sum", None), ("strategy", None),
+    ("average", None), ("average", {"dc": torch.ones(3)}), ("average", lambda _: {"background_gate": torch.ones(1)}),
     ("gate", None), ("gate/logarithm", torch.ones(2)), ("gate/logarithm", 1.0),
     ("gate/logarithm", torch.full((1,), float("nan"))), ("gate/logarithm", torch.full((1,), 1e3)),
     ("gate/adam/exp_avg", torch.ones(2)), ("gate/adam/exp_avg", [0.0]), ("gate/adam/step", "1"),
