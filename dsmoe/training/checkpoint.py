@@ -19,7 +19,7 @@ from .state_check import Misfit, check_model, check_numbers
 TENSOR = "__tensor__"  # marks where a tensor was
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
-FORMAT = 5  # raised when the content changes so that older files cannot be resumed
+FORMAT = 6  # raised when the content changes so that older files cannot be resumed
 
 
 class SoFar(NamedTuple):
@@ -44,9 +44,12 @@ def made_so_far(config: TrainConfig, device: str) -> SoFar:
                 raise Misfit(f"its `{name}` is {theirs!r}; it must be {mine!r}")
         check_model(state, config)
         check_numbers(state)
-        model = GaussianModel(state["raw"], config.sh_degree)
+        average = state["average"]
+        model = GaussianModel(average or state["raw"], config.sh_degree)
         model.active_sh_degree = state["active_sh_degree"]
-        if state["gate"] is None:
+        if "background_gate" in average:
+            gate = float(average["background_gate"])
+        elif state["gate"] is None:
             gate = float(config.background_gate)
         else:
             learned = LearnedGate(config, device)
