@@ -367,7 +367,8 @@ def every_call():
 
 def names_of_ops():
     library = "diff_smoe_rasterization::"
-    return sorted(name[len(library):] for name in torch._C._dispatch_get_all_op_names() if name.startswith(library))
+    return sorted(schema.name[len(library):] for schema in torch._C._jit_get_all_schemas()
+                  if schema.name.startswith(library))
 
 
 @on_every_device

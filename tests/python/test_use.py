@@ -221,8 +221,8 @@ def test_second_derivatives_are_tried_of_every_function_with_a_gradient():
             seen.add(node.name())
             nodes += [each for each, _ in node.next_functions if each is not None]
     assert theirs and theirs <= seen
-    ops = {name.partition("::")[2] for name in torch._C._dispatch_get_all_op_names()
-           if name.startswith("diff_smoe_rasterization::")}
+    ops = {schema.name.partition("::")[2] for schema in torch._C._jit_get_all_schemas()
+           if schema.name.startswith("diff_smoe_rasterization::")}
     assert {op for op in ops if f"{op}_backward" in ops} == {"rasterize", "project", "blend", "activate"}
 
 
