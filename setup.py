@@ -26,7 +26,9 @@ PACKAGE = "diff_smoe_rasterization"
 # the oldest that the toolkit knows, for its major number, and these.
 EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
 USUAL_CARDS = (80, 90)
-# On one core of an AMD EPYC; a kernel's file for the usual cards.
+# What compiling takes on one core of an AMD EPYC, by file: build_support/seconds_to_compile FOLDER wrote it. Files that
+# are not in it, and kernels, for the usual cards:
+SECONDS_TO_COMPILE = ROOT / "build_support" / "seconds_to_compile.txt"
 SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
 # The oldest PyTorch whose stable ABI has what the ops take, and as its headers write it.
 STABLE_ABI_SINCE, TORCH_TARGET_VERSION = "2.11", "0x020b000000000000"
@@ -108,9 +110,16 @@ def jobs():
     return int(os.environ.get("MAX_JOBS") or os.cpu_count() or 1)
 
 
+def seconds_of(sources):
+    """Returns about how long each file compiles on one core."""
+    measured = dict(reversed(line.split()) for line in SECONDS_TO_COMPILE.read_text().splitlines())
+    return [float(measured.get(Path(path).name, SECONDS_OF_A_KERNEL if path.endswith(".cu") else SECONDS_OF_A_FILE))
+            for path in sources]
+
+
 def announcement(sources, without_cuda):
     """What is compiled, and about how long that takes at most: where some of it has been compiled before, less."""
-    seconds = sum(SECONDS_OF_A_KERNEL if path.endswith(".cu") else SECONDS_OF_A_FILE for path in sources) / jobs()
+    seconds = sum(seconds_of(sources)) / jobs()
     why = "; ".join(without_cuda)
     target = "for the CPU" if why else "for CPU and GPU"
     return (f"{PACKAGE}: compiling {len(sources)} files, {jobs()} at once, {target}: "
@@ -247,6 +256,9 @@ def extension():
             folder = Path(self.get_finalized_command("build").build_base).resolve() / name
             files = configure(folder, options_of_cmake(torch, cpp_extension, not without_cuda, stable))
             tell(announcement(files, without_cuda))
+            for file, seconds in zip(files, seconds_of(files)):
+                print(f"cost {seconds:g} {Path(file).name}")  # by which build_support/environment.sh says what is left
+            sys.stdout.flush()
             run_cmake("--build", folder, "--parallel", jobs(), "--target", "dsmoe_package")
             path = Path(self.get_ext_fullpath(module.name))
             path.parent.mkdir(parents=True, exist_ok=True)

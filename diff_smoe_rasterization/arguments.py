@@ -4,6 +4,7 @@ from __future__ import annotations
 import torch
 
 from .autograd import INPUTS, OPTIONS
+from .checks import check_tensor
 from .extension import BACKENDS, build_info
 from .settings import BLEND_MODES, FEATURE_OUTPUTS, OUTPUTS, Rendering, resolve_blend, resolve_faint_below
 
@@ -33,27 +34,44 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
     """Returns the options of a rendering in the order of the op, all but the last one. function: as above."""
     if not _OUTPUTS.issuperset(outputs):
         raise ValueError(f"{function}: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
-    options = [kind(getattr(settings, name)) for name, kind in _SETTING_OPTIONS]
-    for place, name in _WHOLE_OPTIONS:
-        if options[place] != getattr(settings, name):  # int() has cut digits off
-            raise ValueError(f"{name} is {getattr(settings, name)!r}; it must be a whole number")
-    computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
-                "faint_below": resolve_faint_below(blend_mode, settings.faint_below),
-                **{name: name in outputs for name in FEATURE_OUTPUTS}}
-    for name, place in _COMPUTED_OPTIONS.items():
-        options.insert(place, computed[name])
+    given = [getattr(settings, name) for name, _ in _SETTING_OPTIONS]
+    try:
+        options = [kind(value) for value, (_, kind) in zip(given, _SETTING_OPTIONS)]
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        options = None
+    # What is as it was given is no text, which float() and bool() take, and has lost no digits.
+    if options != given or not all([-_WHOLE_LIMIT < options[place] < _WHOLE_LIMIT for place in _WHOLE_OPTIONS]):
+        for (name, kind), value in zip(_SETTING_OPTIONS, given):
+            if not _fits(kind, value):
+                raise ValueError(f"{function}: {name} is {value!r}; it must be {_KINDS[kind]}")
+    faint_below = resolve_faint_below(blend_mode, settings.faint_below)
+    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), *[name in outputs for name in FEATURE_OUTPUTS]]
+    for place, value in zip(_COMPUTED_OPTIONS.values(), computed):
+        options.insert(place, value)
     return options
 
 
+def _fits(kind, value):
+    """Whether a setting can be an option of this type."""
+    try:
+        option = kind(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a tensor of several elements
+        return False
+    return not isinstance(value, str) and (kind is not int or (option == value and abs(option) < _WHOLE_LIMIT))
+
+
 _OUTPUTS = frozenset(OUTPUTS)
+_KINDS = {int: "a whole number below 2^63", float: "a number", bool: "True or False"}
+_WHOLE_LIMIT = 2**63
 
 # The options that are computed, with their places; the others are settings of the same name. `rasterize_op` decides
 # for_backward, which is the last one.
 assert list(OPTIONS)[-1] == "for_backward"
-_COMPUTED_OPTIONS = {name: place for place, name in enumerate(OPTIONS)
-                     if name in ("fixed_background_gate", "blend_mode", "faint_below", *FEATURE_OUTPUTS)}
+_COMPUTED_OPTIONS = {name: list(OPTIONS).index(name)
+                     for name in ("faint_below", "fixed_background_gate", "blend_mode", *FEATURE_OUTPUTS)}
+assert list(_COMPUTED_OPTIONS.values()) == sorted(_COMPUTED_OPTIONS.values())  # they are inserted in this order
 _SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
-_WHOLE_OPTIONS = [(place, name) for place, (name, kind) in enumerate(_SETTING_OPTIONS) if kind is int]
+_WHOLE_OPTIONS = [place for place, (_, kind) in enumerate(_SETTING_OPTIONS) if kind is int]
 
 
 def tensor_checks(function, first_name, first):
@@ -63,8 +81,8 @@ def tensor_checks(function, first_name, first):
     function: the one that errors name. first: the tensor on whose device all others have to be.
     """
     def required(name, value):
-        if not isinstance(value, torch.Tensor):
-            raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
+        if not isinstance(value, torch.Tensor) or value.layout is not torch.strided:
+            check_tensor(function, name, value)
         if value.device != device:
             raise TypeError(f"{function}: {name} is on {value.device}; it must be on {device}, as {first_name} is")
         return value

@@ -7,6 +7,7 @@ Compiled code takes any number of Gaussians and any image size. For another fiel
 from __future__ import annotations
 
 import contextlib
+import functools
 
 import torch
 from torch.autograd import forward_ad
@@ -37,16 +38,71 @@ if not hasattr(_below_autograd, "__enter__"):  # torch 1.13 has it, but not as a
     _below_autograd = contextlib.nullcontext
 
 
-def refuse_forward_mode(function, values):
-    """Raises NotImplementedError where a tensor among the values carries a tangent, which the ops would drop."""
-    if forward_ad._current_level < 0:  # there are no tangents; asking each tensor would cost time
-        return
-    # Tensors that torch.compile traces do not always show their tangents.
+_functorch = getattr(torch._C, "_functorch", None)  # before torch 2.0 it is a package of its own
+
+
+def _is_transformed():
+    """Whether a transform of torch.func calls."""
+    return _functorch is not None and _functorch.peek_interpreter_stack() is not None
+
+
+def refuse_transforms(function, values):
+    """Raises NotImplementedError where torch.func or forward mode differentiates, or maps, a tensor among the values.
+
+    The ops would drop a tangent, and autograd.Function with a context does not know torch.func.
+    """
     compiling = _CAN_REGISTER and torch.compiler.is_compiling()
+    forward, transformed = forward_ad._current_level >= 0, not compiling and _is_transformed()
+    if not forward and not transformed:  # asking each tensor would cost time
+        return
     for value in values:
-        if isinstance(value, torch.Tensor) and (compiling or forward_ad.unpack_dual(value).tangent is not None):
+        if not isinstance(value, torch.Tensor):
+            continue
+        # Tensors that torch.compile traces do not always show their tangents.
+        if forward and (compiling or forward_ad.unpack_dual(value).tangent is not None):
             raise NotImplementedError(f"{function}: forward-mode derivatives (torch.func.jvp, jacfwd, dual tensors) "
                                       "are not implemented; take those of backward mode (torch.autograd.grad)")
+        if transformed and _functorch.is_functorch_wrapped_tensor(value):
+            raise NotImplementedError(f"{function}: torch.func (grad, vjp, jacrev, vmap) is not implemented; take "
+                                      "torch.autograd.grad, and a loop in place of vmap")
+
+
+class _FirstDerivatives(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, function, gradients, *sources):
+        ctx.function = function
+        return tuple(gradients)
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        raise RuntimeError(f"{ctx.function}: second derivatives are not implemented; its gradients cannot be "
+                           "differentiated again")
+
+
+def differentiated_once(function, gradients, sources):
+    """Returns gradients, tensors or None, that raise where they are differentiated again by one of the sources."""
+    marked = iter(_FirstDerivatives.apply(function, [each for each in gradients if each is not None], *sources))
+    return tuple(None if gradient is None else next(marked) for gradient in gradients)
+
+
+def once_differentiable(function):
+    """Decorates `backward` of an autograd.Function that has saved its inputs: second derivatives raise.
+
+    Those of torch's decorator of this name raise only by the incoming gradients. By the inputs they would be dropped,
+    and a loss with a further term would not show it.
+    """
+    def decorate(backward):
+        @functools.wraps(backward)
+        def refusing(ctx, *gradients):
+            if not torch.is_grad_enabled():  # true only with create_graph
+                return backward(ctx, *gradients)
+            with torch.no_grad():
+                results = backward(ctx, *gradients)
+            return differentiated_once(function, results, [*ctx.saved_tensors, *gradients])
+
+        return refusing
+
+    return decorate
 
 
 def _remember(ctx, inputs, options, radii):
@@ -70,7 +126,7 @@ def _keep(ctx, inputs, output):
 def _input_gradients(ctx, wanted, gradients, inputs, images, saved, op):
     """Returns a gradient for each input, None where it is not wanted."""
     image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
-    refuse_forward_mode("rasterize", [*image_gradients, *inputs])
+    refuse_transforms("rasterize", [*image_gradients, *inputs])
     results = iter(op(*image_gradients, inputs, ctx.present, images, saved, *ctx.options, wanted))
     return [next(results) if want else None for want in wanted]
 
@@ -104,15 +160,14 @@ class _Rasterize(torch.autograd.Function):
         ctx.save_for_backward(*given, images[_RADII], *saved)
         return (*images, saved)
 
+    @staticmethod
+    @once_differentiable("rasterize")
     def backward(ctx, *gradients):
         kept, count = list(ctx.saved_tensors), sum(ctx.present)
         images = [*ctx.images[:_RADII], kept[count], *ctx.images[_RADII:]]
-        # Under create_graph=True the registered op is called. It refuses where its result is differentiated again.
-        with contextlib.nullcontext() if torch.is_grad_enabled() else _below_autograd():
+        with _below_autograd():
             return (None, *_input_gradients(ctx, list(ctx.needs_input_grad[1:]), gradients, kept[:count], images,
                                             kept[count + 1:], _OPS.rasterize_backward.default))
-
-    backward = staticmethod(backward if _CAN_REGISTER else torch.autograd.function.once_differentiable(backward))
 
 
 def rasterize_op(function, inputs, options):
@@ -121,7 +176,7 @@ def rasterize_op(function, inputs, options):
     function: the one that the caller called, which errors name. inputs: a tensor or None for each of INPUTS. options: a
     value for each of OPTIONS; the last, `for_backward`, is left out.
     """
-    refuse_forward_mode(function, inputs)
+    refuse_transforms(function, inputs)
     if _CAN_REGISTER and torch.compiler.is_compiling():
         return _OPS.rasterize(*inputs, *options, torch.is_grad_enabled())
     if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs):
@@ -198,16 +253,31 @@ def _fake_gate_map(radii, saved, background_gate, *options):
     return tuple(radii.new_empty((given["image_height"], given["image_width"])) for _ in range(2))
 
 
+def _on_one_device(name, fake):
+    """Returns the fake op, which first refuses tensors on several devices: torch calls it for one on `meta` too."""
+    names = [argument.name for argument in getattr(_OPS, name).default._schema.arguments]
+
+    def checked(*arguments):
+        tensors = [(of, tensor) for of, value in zip(names, arguments)
+                   for tensor in (value if isinstance(value, (list, tuple)) else [value])
+                   if isinstance(tensor, torch.Tensor)]
+        first_name, first = tensors[0]
+        for of, tensor in tensors:
+            if tensor.device != first.device:
+                raise TypeError(f"{name}: {of} is on {tensor.device}; it must be on {first.device}, as {first_name} "
+                                "is")
+        return fake(*arguments)
+
+    return checked
+
+
 if _CAN_REGISTER:
     _NAME = "diff_smoe_rasterization::"
-    torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
-    torch.library.register_fake(_NAME + "rasterize_backward", _fake_rasterize_backward)
-    torch.library.register_fake(_NAME + "project", _fake_project)
-    torch.library.register_fake(_NAME + "project_backward", _fake_project_backward)
-    torch.library.register_fake(_NAME + "radii", _fake_radii)
-    torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
-    torch.library.register_fake(_NAME + "contributions", _fake_contributions)
-    torch.library.register_fake(_NAME + "importance", _fake_importance)
-    torch.library.register_fake(_NAME + "gate_map", _fake_gate_map)
+    for _op, _fake in (("rasterize", _fake_rasterize), ("rasterize_backward", _fake_rasterize_backward),
+                       ("project", _fake_project), ("project_backward", _fake_project_backward),
+                       ("radii", _fake_radii), ("mark_visible", _fake_mark_visible),
+                       ("contributions", _fake_contributions), ("importance", _fake_importance),
+                       ("gate_map", _fake_gate_map)):
+        torch.library.register_fake(_NAME + _op, _on_one_device(_op, _fake))
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
     torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)

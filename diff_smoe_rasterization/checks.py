@@ -7,11 +7,23 @@ from typing import Any
 import torch
 
 
+def check_tensor(function: str, name: str, value: Any) -> None:
+    """Raises TypeError where a named argument of a function is no dense tensor."""
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
+    if value.layout is not torch.strided:
+        raise TypeError(f"{function}: {name} is sparse ({value.layout}); it must be dense: {name}.to_dense()")
+
+
 def check_tensors(function: str, **values: Any) -> None:
-    """Raises TypeError where one of the named arguments of a function is no tensor."""
+    """Raises TypeError where one of the named arguments of a function is no dense tensor, or on another device."""
+    first_name, device = "", None
     for name, value in values.items():
-        if not isinstance(value, torch.Tensor):
-            raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
+        check_tensor(function, name, value)
+        if device is None:
+            first_name, device = name, value.device
+        elif value.device != device:
+            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {device}, as {first_name} is")
 
 
 def checked_number(function: str, name: str, value: Any) -> float:

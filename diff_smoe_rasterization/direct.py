@@ -1,12 +1,13 @@
 """A rendering and its gradients without autograd, for a loop that knows what it wants of them."""
 from __future__ import annotations
 
-from typing import Dict, Optional, Sequence
+from typing import Dict, List, Optional, Sequence
 
 import torch
 
 from .arguments import as_rendering, op_arguments
-from .autograd import IMAGES, INPUTS, refuse_forward_mode
+from .autograd import IMAGES, INPUTS, refuse_transforms
+from .checks import check_tensors
 from .settings import FEATURE_OUTPUTS, GaussianRasterizationSettings, Rendering
 from .splats import Splats
 
@@ -31,8 +32,9 @@ class DirectRendering:
         self._inputs, self._options = op_arguments(
             "DirectRendering", settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
             colors_precomp=colors_precomp, scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
-        refuse_forward_mode("DirectRendering", self._inputs)
+        refuse_transforms("DirectRendering", self._inputs)
         self._outputs = outputs
+        self._images: Optional[List[torch.Tensor]] = None
 
     @torch.no_grad()
     def visible_radii(self) -> torch.Tensor:
@@ -53,8 +55,8 @@ class DirectRendering:
         return as_rendering(self._images, self._outputs)
 
     def splats(self) -> Splats:
-        """What `rasterize_with_splats` returns beside the images, after `render`."""
-        return Splats(self._images, self._saved, self._inputs, self._options)
+        """What `rasterize_with_splats` returns beside the images, after `render`. Raises RuntimeError before it."""
+        return Splats(self._rendered("splats"), self._saved, self._inputs, self._options)
 
     @torch.no_grad()
     def backward(self, dL_dimages: Dict[str, torch.Tensor], gradients: Dict[str, torch.Tensor]) -> None:
@@ -62,10 +64,11 @@ class DirectRendering:
 
         dL_dimages: by name, `color` and OUTPUTS. gradients: for the arguments whose gradients are wanted, by name, also
         bg and background_gate; dense and of their shape. Of those with a row for each Gaussian only the rows are
-        written whose radius is above 0. The others stay as they are. Raises RuntimeError where an argument or an image
-        was changed in place since `render`.
+        written whose radius is above 0. The others stay as they are. Raises RuntimeError before `render`, and where an
+        argument or an image was changed in place since.
         """
-        for name, tensor, version in zip((*INPUTS, *IMAGES), (*self._inputs, *self._images), self._versions):
+        images = self._rendered("backward")
+        for name, tensor, version in zip((*INPUTS, *IMAGES), (*self._inputs, *images), self._versions):
             if _version(tensor) != version:
                 raise RuntimeError(f"DirectRendering.backward: {name} was changed in place since render; change it "
                                    "after backward, or change a copy")
@@ -74,12 +77,20 @@ class DirectRendering:
             raise ValueError(f"DirectRendering.backward: dL_dimages has {', '.join(dL_dimages)} and gradients has "
                              f"{', '.join(gradients)}; they may have {', '.join(_GRADIENTS)} and arguments that "
                              "are given")
+        check_tensors("DirectRendering.backward", **{
+            "means3D": self._inputs[0], **{f"dL_dimages[{name!r}]": value for name, value in dL_dimages.items()},
+            **{f"gradients[{name!r}]": value for name, value in gradients.items()}})
         by_image = {_GRADIENTS[name]: gradient for name, gradient in dL_dimages.items()}
         _OPS.rasterize_backward_seen(
             *(by_image.get(name) for name in IMAGES if name != "radii"),
             [value for value in self._inputs if value is not None], [value is not None for value in self._inputs],
-            self._images, self._saved, *self._options, True, [name in gradients for name in INPUTS],
+            images, self._saved, *self._options, True, [name in gradients for name in INPUTS],
             [gradients[name] for name in INPUTS if name in gradients])
+
+    def _rendered(self, function: str) -> List[torch.Tensor]:
+        if self._images is None:
+            raise RuntimeError(f"DirectRendering.{function}: nothing is rendered yet; call render first")
+        return self._images
 
 
 def _version(tensor: Optional[torch.Tensor]) -> int:

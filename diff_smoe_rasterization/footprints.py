@@ -14,7 +14,7 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 import torch
 
 from .arguments import as_rendering, op_arguments, op_options, tensor_checks
-from .autograd import INPUTS, OPTIONS, refuse_forward_mode
+from .autograd import INPUTS, OPTIONS, once_differentiable, refuse_transforms
 from .core import _core
 from .settings import BLEND_MODES, GaussianRasterizationSettings, Rendering, resolve_blend
 
@@ -84,7 +84,7 @@ def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: 
     inputs, options = op_arguments("project_gaussians", settings, outputs, means3D, opacities, means2D=means2D, dc=dc,
                                    shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                    cov3D_precomp=cov3D_precomp)
-    refuse_forward_mode("project_gaussians", inputs)
+    refuse_transforms("project_gaussians", inputs)
     if _wants_gradient(inputs):
         return Footprints(*_Project.apply((*options, True), *inputs))
     return Footprints(*_OPS.project(*inputs, *options, False))
@@ -116,7 +116,7 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
     Raises ValueError, TypeError or RuntimeError as `rasterize` does.
     """
     tensors, options = blend_op_arguments(footprints, settings, outputs)
-    refuse_forward_mode("blend_footprints", tensors)
+    refuse_transforms("blend_footprints", tensors)
     if _wants_gradient(tensors):
         images = _Blend.apply((*options, True), *tensors)
     else:
@@ -163,7 +163,7 @@ class _Project(torch.autograd.Function):
         return gates, features, radii
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable("project_gaussians")
     def backward(ctx: Any, dL_dgates: Any, dL_dfeatures: Any, _: Any) -> Tuple[Any, ...]:  # type: ignore[override]
         *inputs, features, opacities, radii = ctx.saved_tensors
         wanted = list(ctx.needs_input_grad[1:])
@@ -189,13 +189,13 @@ class _Blend(torch.autograd.Function):
         ctx.options, ctx.has_gate = options, background_gate is not None
         ctx.images = [image.clone() for image in images]  # the caller may edit them
         gate = () if background_gate is None else (background_gate,)
-        ctx.save_for_backward(gates, radii, bg, *gate, *saved)
+        ctx.save_for_backward(gates, features, radii, bg, *gate, *saved)
         return tuple(images)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable("blend_footprints")
     def backward(ctx: Any, *image_gradients: Any) -> Tuple[Any, ...]:  # type: ignore[override]
-        gates, radii, bg, *kept = ctx.saved_tensors
+        gates, _, radii, bg, *kept = ctx.saved_tensors
         gate = kept.pop(0) if ctx.has_gate else None
         wants_background = ctx.needs_input_grad[4] or ctx.needs_input_grad[5]
         records, dL_dbg, dL_dgate = _OPS.blend_backward(*image_gradients, ctx.images, kept, radii, bg, gate,

@@ -5,7 +5,7 @@ from typing import Any, Tuple
 
 import torch
 
-from .autograd import refuse_forward_mode
+from .autograd import once_differentiable, refuse_transforms
 from .checks import check_tensors, checked_number
 from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 
@@ -21,7 +21,7 @@ def activate(opacities: torch.Tensor, scales: torch.Tensor,
     Raises ValueError or TypeError where shapes, types or devices do not fit.
     """
     check_tensors("activate", opacities=opacities, scales=scales, rotations=rotations)
-    refuse_forward_mode("activate", (opacities, scales, rotations))
+    refuse_transforms("activate", (opacities, scales, rotations))
     if torch.is_grad_enabled() and (opacities.requires_grad or scales.requires_grad or rotations.requires_grad):
         return _Activate.apply(opacities, scales, rotations)
     return _OPS.activate(opacities, scales, rotations)
@@ -57,7 +57,7 @@ class _Activate(torch.autograd.Function):
         return values
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable("activate")
     def backward(ctx: Any, *dL_dvalues: Any) -> Tuple[torch.Tensor, ...]:  # type: ignore[override]
         saved = ctx.saved_tensors
         return _OPS.activate_backward(saved[:3], saved[3:], *dL_dvalues)

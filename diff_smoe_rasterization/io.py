@@ -11,11 +11,14 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
-from .core import _core
-
-_io = _core.io
-
 PathLike = Union[str, "os.PathLike[str]"]
+
+
+def _io() -> Any:
+    """The compiled readers and writers. They load at the first use: `dsmoe scene` needs only the records below."""
+    from .core import _core
+
+    return _core.io
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,7 @@ def read_gaussians(path: PathLike) -> Gaussians:
     NaN and infinities are returned as they are. Raises OSError; ValueError for malformed content, a missing column,
     comments that record two different blend modes or background gates, or a gate that is none.
     """
-    return Gaussians(**_io.read_gaussians(os.fsencode(path)))
+    return Gaussians(**_io().read_gaussians(os.fsencode(path)))
 
 
 def write_gaussians(path: PathLike, gaussians: Gaussians) -> None:
@@ -114,7 +117,8 @@ def write_gaussians(path: PathLike, gaussians: Gaussians) -> None:
         "rotations": (count, 4),
     }
     arrays = [_array("write_gaussians", name, getattr(g, name), np.float32, shape) for name, shape in shapes.items()]
-    _io.write_gaussians(os.fsencode(path), sh_degree, *arrays, g.blend_mode or "", g.background_gate, list(g.comments))
+    _io().write_gaussians(os.fsencode(path), sh_degree, *arrays, g.blend_mode or "", g.background_gate,
+                          list(g.comments))
 
 
 def read_points(path: PathLike) -> Points:
@@ -122,7 +126,7 @@ def read_points(path: PathLike) -> Points:
 
     Raises OSError; ValueError for malformed content and for a position that is NaN or infinite.
     """
-    return Points(**_io.read_points(os.fsencode(path)))
+    return Points(**_io().read_points(os.fsencode(path)))
 
 
 def write_points(path: PathLike, points: Points) -> None:
@@ -132,7 +136,7 @@ def write_points(path: PathLike, points: Points) -> None:
     """
     positions, colors = _cloud("write_points", points)
     normals = _optional_array("write_points", "normals", points.normals, np.float32, (len(positions), 3))
-    _io.write_points(os.fsencode(path), positions, colors, normals, list(points.comments))
+    _io().write_points(os.fsencode(path), positions, colors, normals, list(points.comments))
 
 
 def read_colmap(folder: PathLike) -> ColmapModel:
@@ -141,8 +145,8 @@ def read_colmap(folder: PathLike) -> ColmapModel:
     Binary files are preferred to text files. Raises FileNotFoundError naming what was looked for; ValueError for
     malformed content, a model without cameras or images, and an image whose camera is not there.
     """
-    found = _io.find_colmap_folder(os.fsencode(folder))
-    content = _io.read_colmap(found)
+    found = _io().find_colmap_folder(os.fsencode(folder))
+    content = _io().read_colmap(found)
     cameras = {fields[0]: ColmapCamera(*fields) for fields in content["cameras"]}
     images = [
         ColmapImage(image_id, os.fsdecode(name), camera_id, qvec, tvec)
@@ -153,7 +157,7 @@ def read_colmap(folder: PathLike) -> ColmapModel:
 
 def read_colmap_cameras(path: PathLike) -> Dict[int, ColmapCamera]:
     """Reads one cameras.bin or cameras.txt, by id; for data that has no images file. Raises as `read_colmap`."""
-    return {fields[0]: ColmapCamera(*fields) for fields in _io.read_colmap_cameras(os.fsencode(path))}
+    return {fields[0]: ColmapCamera(*fields) for fields in _io().read_colmap_cameras(os.fsencode(path))}
 
 
 def write_colmap(folder: PathLike, model: ColmapModel, text: bool = False) -> None:
@@ -178,7 +182,7 @@ def write_colmap(folder: PathLike, model: ColmapModel, text: bool = False) -> No
     ]
     positions, colors = _cloud("write_colmap", model.points)
     errors = _optional_array("write_colmap", "point_errors", model.point_errors, np.float64, (len(positions),))
-    _io.write_colmap(os.fsencode(folder), cameras, images, positions, colors, errors, text)
+    _io().write_colmap(os.fsencode(folder), cameras, images, positions, colors, errors, text)
 
 
 def _sh_degree(function: str, shs: Any) -> int:

@@ -5,7 +5,7 @@ from typing import Any, Tuple
 
 import torch
 
-from .autograd import refuse_forward_mode
+from .autograd import once_differentiable, refuse_transforms
 from .checks import check_tensors, checked_number
 from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 from .images import as_float
@@ -71,7 +71,7 @@ def _refuse_gradient(function: str, name: str, tensor: torch.Tensor) -> None:
 
 
 def _image_loss(image: torch.Tensor, *arguments: Any) -> torch.Tensor:
-    refuse_forward_mode("SSIM and the image loss", [image, *arguments])
+    refuse_transforms("SSIM and the image loss", [image, *arguments])
     if image.requires_grad and torch.is_grad_enabled():
         return _ImageLoss.apply(image, *arguments)
     return _OPS.image_loss(image, *arguments, False)[0]
@@ -83,13 +83,11 @@ class _ImageLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: torch.Tensor, *arguments: Any) -> torch.Tensor:
         loss, gradient = _OPS.image_loss(image, *arguments, True)
-        ctx.save_for_backward(gradient)
+        ctx.save_for_backward(image, gradient)
         return loss
 
     @staticmethod
+    @once_differentiable("SSIM and the image loss")
     def backward(ctx: Any, dL_dloss: torch.Tensor) -> Tuple[Any, ...]:  # type: ignore[override]
-        if torch.is_grad_enabled():  # true only with create_graph
-            raise RuntimeError("SSIM and the image loss: second derivatives are not implemented; leave out "
-                               "create_graph=True")
-        gradient, = ctx.saved_tensors
+        _, gradient = ctx.saved_tensors
         return (gradient * dL_dloss,) + (None,) * 5

@@ -40,14 +40,15 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     Returns: Rendering. A Gaussian with a NaN or infinite attribute, or an opacity above 1e20, is culled: radius 0,
     gradients 0.
     Raises:
-        ValueError: a shape or a value does not fit; both or neither of shs and colors_precomp, or of scales with
-            rotations and cov3D_precomp, are given; background_gate does not fit the blend mode; under
-            `settings.strict` an attribute is not finite; under `settings.prefiltered` a Gaussian is not beyond the near
-            plane.
+        ValueError: a shape or a value does not fit; bg or what is read of the camera's tensors is not finite; both or
+            neither of shs and colors_precomp, or of scales with rotations and cov3D_precomp, are given;
+            background_gate does not fit the blend mode; under `settings.strict` an attribute is not finite; under
+            `settings.prefiltered` a Gaussian is not beyond the near plane.
         TypeError: a type or a device does not fit.
         RuntimeError: the Gaussians cover more tiles than fit; under `settings.debug` a result or gradient is NaN.
 
-    On CUDA the value of a tensor background_gate is not checked: the host would have to wait for it.
+    On CUDA the values of the camera's tensors, of bg and of a tensor background_gate are not checked: the host would
+    have to wait for them. `settings.debug` names a NaN there.
     """
     inputs, options = op_arguments("rasterize", settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
                                    colors_precomp=colors_precomp, scales=scales, rotations=rotations,

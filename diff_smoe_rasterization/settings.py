@@ -212,7 +212,7 @@ def _weight(name: str, given: Any, text_counts: bool = True, other: str = "") ->
     """
     try:
         value = math.nan if isinstance(given, str) and not text_counts else float(given)
-    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several elements
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a tensor of several elements
         value = math.nan
     if not 0 <= value <= MAX_BACKGROUND_GATE:
         raise ValueError(f"{name} is {given!r}; it must be a number, 0 or more and at most "

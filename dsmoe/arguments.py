@@ -45,7 +45,7 @@ def build_parser() -> argparse.ArgumentParser:
                              help="continue the run in OUT from its last checkpoint with its own options; more "
                                   "--iterations extend it")
     earlier_run.add_argument("--overwrite", action="store_true",
-                             help="replace the run in OUT, once this one can start")
+                             help="replace the run in OUT, once this one can start; other files there stay")
     groups["run"].add_argument(
         "--gpus", type=int, metavar="N",
         help="train on so many GPUs of this machine: torchrun starts this command once for each; with --batch N or "

@@ -206,11 +206,14 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
 
 def _scene(arguments: argparse.Namespace) -> None:
     from .photos import make_scene
-    from .system.process import command
+    from .short_run import train_command
+    from .system.device import device_to_train_on
 
-    print(make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
-                     not arguments.quiet, say=lambda text: print(text, flush=True)))
-    print(f"to train on it: {command()} train {shlex.quote(arguments.output)} -o MODEL")
+    device = device_to_train_on()
+    made = make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
+                      not arguments.quiet, say=lambda text: print(text, flush=True))
+    print(made)
+    print(f"to train on it: {train_command(arguments.output, 'MODEL', device, *made.size)}")
 
 
 def _eval(arguments: argparse.Namespace) -> None:

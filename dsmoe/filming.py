@@ -30,7 +30,7 @@ def film(trained: Trained, path: str, frames: int = ORBIT_FRAMES, fps: float = V
         check_folder(path, orbit=True)
     cameras = trained.orbit.cameras(frames, trained.cameras[0])
     if not is_video(path):
-        of = f"{said_of_images(trained.config, trained.ply, trained.renderer)}, an orbit of {frames}"
+        of = f"{said_of_images(trained.config, trained.path, trained.renderer)}, an orbit of {frames}"
         return f"{len(write_images(trained.renderer, cameras, path, of, outputs, overwrite))} images in {path}"
     if outputs:
         raise TrainerError(f"{path}: a video has room for colours only; with --{outputs[0]} -o names a folder")

@@ -2,17 +2,19 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+import sys
+from dataclasses import replace
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from PIL import Image
 
 from .config import CHECKPOINT_NAME, LEARNED, TrainConfig
-from .errors import TrainerError
+from .errors import TrainerError, printable
 from .results.evaluation import Measure, evaluate
 from .results.metrics import image_metrics, quantised
-from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
+from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, model_path
 from .results.pictures import file_names
 from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
@@ -20,11 +22,11 @@ from .results.video import check_folder
 from .scenes.cameras import Camera
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
 from .system.device import check_device
-from .system.files import write_json_atomically
+from .system.files import is_file, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.progress import progress_bar
 from .train import PER_VIEW_NAME
-from .training.checkpoint import damage_named, load_checkpoint
+from .training.checkpoint import SoFar, damage_named, load_checkpoint, made_so_far
 
 RENDER = "dsmoe render"  # in its folders' records
 
@@ -34,6 +36,8 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
                  measure: Measure = image_metrics) -> Dict[str, Any]:
     """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
 
+    Of a training that has not ended, its checkpoint is measured, and nothing is written.
+
     scene_folder: where the scene lies, if not where it was trained. Where it is another scene, as one that has changed
     since, or that is not known, a line says so; another scene's row is not written. measure: as in `evaluate`. A
     folder that cannot be written to is told, no error. Raises TrainerError.
@@ -41,14 +45,13 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     options = {"scene": scene_folder} if scene_folder else {}
     config = TrainConfig.of_run(output, "--scene", device=device, **options)
     check_device(device)
-    ply = trained_model_path(output, config.iterations)
+    opened = open_run(config, None, None, device, rasterize)
     earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     layout = read_layout(config)
     scene = load_scene(config, progress, layout).to(device)
     note, is_other = _compared(scene, config)
     for line in filter(None, (layout.warning, note)):
         print(line)
-    renderer = open_renderer(config, ply, config.blend_mode, device, rasterize, _gate_of(config))
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
         raise TrainerError(f"scene {config.scene} has no {split} views")
@@ -57,10 +60,12 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
         raise TrainerError(f"{config.scene} has {'no masks' if masked else 'masks'}, but the run was measured "
                            f"{'with' if masked else 'without'} them: these would be figures of other pixels; "
                            f"{'put them back' if masked else 'rename the folder'}, or name another --scene")
+    renderer, seconds = opened.renderer, earlier[0].get("train_seconds") if earlier else None
     evaluation = evaluate(renderer, views, device, progress, measure)
-    seconds = earlier[0].get("train_seconds") if earlier else None
+    if opened.so_far:
+        config, seconds = replace(config, iterations=opened.so_far.iteration), opened.so_far.seconds
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
-    if split == "test" and not is_other:
+    if split == "test" and not is_other and not opened.so_far:
         try:
             write_results(output, [row])
             write_json_atomically(os.path.join(output, PER_VIEW_NAME), evaluation.per_view)
@@ -73,8 +78,7 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
                   rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
     """A renderer for a .ply with the blend mode and the background gate that it records.
 
-    config gives background and antialiasing. A mode that has another name now is told on stderr. Raises TrainerError
-    where what is asked disagrees with the file.
+    config gives background and antialiasing. Raises TrainerError where what is asked disagrees with the file.
     """
     model, recorded = load_model(ply, device)
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
@@ -83,18 +87,37 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
                     background_gate=gate)
 
 
-def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
-             rasterize: Optional[Rasterize] = None) -> Tuple[Renderer, str]:
-    """A renderer for the model of the run that config is of, and its .ply.
+class OpenedRun(NamedTuple):
+    """The model of a run."""
 
-    Raises TrainerError where the run has not ended, and where what is asked disagrees with it.
+    renderer: Renderer
+    path: str  # its .ply, or the checkpoint
+    so_far: Optional[SoFar]  # what the checkpoint holds, where the training has not ended
+
+
+def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
+             rasterize: Optional[Rasterize] = None) -> OpenedRun:
+    """A renderer for the model of the run that config is of; before its end, of its checkpoint, which a line says.
+
+    Raises TrainerError where there is neither, and where what is asked disagrees with the run.
     """
-    ply = trained_model_path(config.output, config.iterations)
     mode = agreed_blend_mode(config.output, config.blend_mode, asked_blend_mode)
     if config.background_gate != LEARNED:
         recorded = Recorded(mode, float(config.background_gate))
         asked_gate = agreed_background_gate(config.output, mode, recorded, asked_gate)
-    return open_renderer(config, ply, mode, device, rasterize, asked_gate), ply
+    ply = model_path(config.output, config.iterations)
+    if is_file(ply):
+        return OpenedRun(open_renderer(config, ply, mode, device, rasterize, asked_gate), ply, None)
+    if not is_file(os.path.join(config.output, CHECKPOINT_NAME)):
+        raise TrainerError(f"{ply}: no such file; the training in {config.output} has not ended, and has no checkpoint "
+                           "yet (continue it with --resume)")
+    so_far = made_so_far(config, device)
+    gate = agreed_background_gate(so_far.path, mode, Recorded(mode, so_far.background_gate), asked_gate)
+    print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
+          f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
+    renderer = Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
+                        rasterize, background_gate=gate)
+    return OpenedRun(renderer, so_far.path, so_far)
 
 
 def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
@@ -112,11 +135,6 @@ def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
             f"{RESULTS_NAME} stays"), True
 
 
-def _gate_of(config: TrainConfig) -> Optional[float]:
-    """The gate that a run names; None where it was learned: then only its .ply has it."""
-    return None if config.background_gate == LEARNED else float(config.background_gate)
-
-
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
                   blend_mode: Optional[str] = None, device: str = "cpu",
                   rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
@@ -128,14 +146,14 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
     depth in the scene's units, 0 where nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
 
-    ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: the model of the
-    run that config is of, whose record these two must not contradict. Raises TrainerError.
+    ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: what `open_run`
+    opens of the run that config is of, whose record these two must not contradict. Raises TrainerError.
     """
     check_device(device)
     check_folder(folder, orbit=False)
     own_record(folder, RENDER, overwrite)  # refused before anything is read
     if ply is None:
-        renderer, ply = open_run(config, blend_mode, background_gate, device, rasterize)
+        renderer, ply, _ = open_run(config, blend_mode, background_gate, device, rasterize)
     else:
         renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
     cameras = load_cameras(config, split)

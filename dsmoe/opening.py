@@ -21,15 +21,16 @@ class Trained:
     """An opened model."""
 
     config: TrainConfig  # the run's; of a .ply only background, resolution and scene mean something
-    ply: str
+    path: str  # the .ply; of a training that has not ended, the checkpoint
     renderer: Renderer
     cameras: List[Camera]  # of the scene's test views, else of its training views; one on the orbit without a scene
     orbit: Orbit
+    has_ended: bool = True  # the training
 
 
 def open_trained(source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
                  device: str = "cpu", **options: Any) -> Trained:
-    """Opens the output folder of `dsmoe train`, or a .ply.
+    """Opens the output folder of `dsmoe train`, before its end the checkpoint in it, or a .ply.
 
     blend_mode, background_gate: needed for a .ply that does not record them; they must agree where something does.
     options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. None are where the
@@ -39,12 +40,12 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
     check_source(source)
     if is_folder(source):
         config = TrainConfig.load(source).changed(**options)
-        renderer, ply = open_run(config, blend_mode, background_gate, device)
+        renderer, path, so_far = open_run(config, blend_mode, background_gate, device)
     else:
-        config, ply = TrainConfig(blend_mode="alpha", **options).validate(), source
-        renderer = open_renderer(config, ply, blend_mode, device, asked_gate=background_gate)
+        config, path, so_far = TrainConfig(blend_mode="alpha", **options).validate(), source, None
+        renderer = open_renderer(config, path, blend_mode, device, asked_gate=background_gate)
     cameras, orbit = places(config, renderer.model, needed="scene" in options)
-    return Trained(config, ply, renderer, cameras, orbit)
+    return Trained(config, path, renderer, cameras, orbit, so_far is None)
 
 
 def check_source(source: str, besides: str = "") -> None:

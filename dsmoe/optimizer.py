@@ -14,6 +14,7 @@ from .model import PARAMETERS, GaussianModel
 from .system.process import return_spare_memory
 
 ADAM_EPSILON = 1e-15
+VALUES = ("raw", "average")  # what a new Gaussian begins with; its moments begin at zero
 
 
 class GaussianOptimizer:
@@ -37,6 +38,8 @@ class GaussianOptimizer:
         }
         rates = {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
         self.rates = rates
+        self.average: Dict[str, torch.Tensor] = {}
+        """Of the parameters over steps, by name, and of the background's gate if it is learned; empty: none is kept."""
         self.adam = FusedAdam([{"params": [model.raw[name]], "lr": rates[name], "name": name} for name in PARAMETERS],
                               eps=ADAM_EPSILON, betas=batch_betas(config.batch))
 
@@ -70,6 +73,20 @@ class GaussianOptimizer:
         for tensor in self.model.stored.values():
             tensor.grad = None
 
+    @torch.no_grad()
+    def add_to_average(self, part: float, background_gate: Optional[torch.Tensor] = None) -> None:
+        """Takes the average this part of the way to the parameters as they are now; the first call begins it there.
+
+        background_gate: [1] one more, where it is learned.
+        """
+        now = {name: tensor.detach() for name, tensor in self.model.raw.items()}
+        if background_gate is not None:
+            now["background_gate"] = background_gate
+        if not self.average:
+            self.average = {name: tensor.clone() for name, tensor in now.items()}
+        for name, tensor in self.average.items():
+            tensor.lerp_(now[name], part)
+
     def append(self, rows: Dict[str, torch.Tensor]) -> None:
         """Adds Gaussians, raw parameters as in PARAMETERS; their moments start at zero."""
         for name in PARAMETERS:
@@ -93,7 +110,7 @@ class GaussianOptimizer:
             taken = torch.ops.diff_smoe_rasterization.gather_rows([tensor.detach() for tensor in old.values()], rows)
             tensors = dict(zip(old, taken))
             for key, tensor in tensors.items():
-                if key != "raw":
+                if key not in VALUES:
                     tensor[len(tensor) - fresh:] = 0
                 elif name in new:
                     tensor[len(tensor) - fresh:] = new[name]
@@ -114,6 +131,8 @@ class GaussianOptimizer:
         for name in PARAMETERS:
             tensor = self.model.raw[name]
             tensor.index_copy_(0, rows, raw[name])
+            if name in self.average:
+                self.average[name].index_copy_(0, rows, raw[name])
             state = self.adam.state.get(tensor)
             if not state:
                 continue
@@ -131,23 +150,29 @@ class GaussianOptimizer:
             self._replace(name, lambda rows, _: edit(rows), tensor.new_zeros(0))
 
     def replace_all(self, raw: Dict[str, torch.Tensor]) -> None:
-        """Sets every parameter, any number of rows, and forgets all moments."""
+        """Sets every parameter, any number of rows, and forgets all moments and the average."""
         self.model.lazy = None
+        self.average = {}
         self.adam.state.clear()
         for name in PARAMETERS:
             self._replace(name, lambda _, new: new.clone(), raw[name])
 
     def _replace(self, name: str, edit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
                  rows: torch.Tensor) -> None:
-        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments."""
-        self._put(name, {key: edit(tensor.detach(), rows.detach() if key == "raw" else torch.zeros_like(rows))
+        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments.
+
+        Its average is edited as itself.
+        """
+        self._put(name, {key: edit(tensor.detach(), rows.detach() if key in VALUES else torch.zeros_like(rows))
                          for key, tensor in self._tensors(name).items()})
 
     def _tensors(self, name: str) -> Dict[str, torch.Tensor]:
-        """The parameter, `raw`, and its moments, where it has some, by their names in Adam's state."""
+        """The parameter, `raw`, its `average` and its moments by their names in Adam's state, where it has these."""
         parameter = self.model.raw[name]
-        state = self.adam.state.get(parameter, {})
-        return {"raw": parameter, **{key: state[key] for key in ("exp_avg", "exp_avg_sq") if key in state}}
+        state = {**self.adam.state.get(parameter, {})}
+        if name in self.average:
+            state["average"] = self.average[name]
+        return {"raw": parameter, **{key: state[key] for key in ("average", "exp_avg", "exp_avg_sq") if key in state}}
 
     def _put(self, name: str, tensors: Dict[str, torch.Tensor]) -> None:
         """Puts others in place of what `_tensors` gives.
@@ -159,6 +184,8 @@ class GaussianOptimizer:
             self.model.lazy = None  # `_tensors` has brought it up to date
         moments = {key: tensor.contiguous() for key, tensor in tensors.items()}
         new = moments.pop("raw").requires_grad_()
+        if "average" in moments:
+            self.average[name] = moments.pop("average")
         state = self.adam.state.pop(self.model.stored[name], None)
         if state is not None:
             state.update(moments)

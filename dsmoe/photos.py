@@ -42,6 +42,7 @@ class Made:
     points: int
     error: float  # mean reprojection error, pixels
     left_out: List[str]
+    size: Tuple[int, int]  # width and height of its first image
 
     def __str__(self) -> str:
         more = ", ..." if self.left_out[3:] else ""
@@ -87,7 +88,7 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
         write_record(output, SCENE, Record(subject, files), files)
     placed = {best.images[number].name for number in best.reg_image_ids()}
     return Made(output, len(names), len(placed), best.num_points3D(), best.compute_mean_reprojection_error(),
-                sorted({*names} - placed))
+                sorted({*names} - placed), image_size(os.path.join(output, files[0])))
 
 
 def _check_folder(photos: str) -> None:

@@ -120,6 +120,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
           f"results and models: {output}; pictures: {', '.join(pictures)}")
     print(viewer_warning(rows[1]))
+    print(f"for photographs of yours: {command()} scene PHOTOS -o SCENE, which ends with the command that trains")
     print(f"to look at it in a browser: {command()} export {shlex.quote(os.path.join(output, MODES[1]))} -o model.html")
     return rows
 

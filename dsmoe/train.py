@@ -28,6 +28,7 @@ from .system.output_folder import (
     make_folder,
     only_one,
     read_record,
+    refuse_others,
     remove_files,
     write_record,
 )
@@ -223,6 +224,8 @@ def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = F
         if there:
             raise TrainerError(f"{output} holds {', '.join(there)} but no {CONFIG_NAME}: no run of {TRAIN} "
                                "is known to have written them; choose another folder")
+        if record is None and not overwrite:
+            refuse_others(output, TRAIN, "; --overwrite trains beside what is there")
     elif not resume and not overwrite:
         raise TrainerError(f"{output} already holds a training run; continue it with --resume, "
                            "replace it with --overwrite, or choose another folder")

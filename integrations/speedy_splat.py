@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 
 from diff_smoe_rasterization import rasterize_with_splats
+from diff_smoe_rasterization.autograd import differentiated_once
 
 from ._rasterizer import classes_of, results_of
 
@@ -21,12 +22,15 @@ class _Scored(torch.autograd.Function):
     @staticmethod
     def forward(ctx, color, scores, splats):
         ctx.splats = splats
-        ctx.shape = scores.shape
+        ctx.sources = color, scores  # not saved by torch, as the caller may edit the image in place
         return color.view_as(color)
 
     @staticmethod
     def backward(ctx, gradient):
-        return gradient, ctx.splats.importance().removal_costs.reshape(ctx.shape), None
+        costs = ctx.splats.importance().removal_costs.reshape(ctx.sources[1].shape)
+        if torch.is_grad_enabled():  # true only with create_graph
+            costs, = differentiated_once("rasterize_gaussians", [costs], ctx.sources)
+        return gradient, costs, None
 
 
 def _render(settings, inputs):

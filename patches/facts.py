@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import inspect
 import itertools
 import re
 from pathlib import Path
@@ -271,9 +270,17 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
 
 
 def arguments_of_gsplat() -> Set[str]:
-    """The names of what gsplat's `rasterization` may be given here."""
-    from diff_smoe_rasterization.integrations import gsplat
-    return {*inspect.signature(gsplat.rasterization).parameters, *gsplat.OF_LATER_VERSIONS} - {"others"}
+    """Returns the names of what gsplat's `rasterization` may be given here.
+
+    They are read from the module's text, since importing it takes the compiled extension.
+    """
+    text = Path(contracts.__file__).with_name("gsplat.py").read_bytes()
+    for node in tree_of(text).body:
+        if isinstance(node, ast.FunctionDef) and node.name == "rasterization":
+            taken = {argument.arg for argument in node.args.args}
+        elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "OF_LATER_VERSIONS":
+            later = {key.value for key in node.value.keys}  # type: ignore[attr-defined]
+    return taken | later
 
 
 def _order(found: str) -> Optional[Tuple[str, ...]]:

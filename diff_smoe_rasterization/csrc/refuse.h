@@ -36,6 +36,21 @@ template <class S> void refuse_unless_positive(const char* function, const char*
   refuse(function, name, " is ", value, "; it must be positive and finite");
 }
 
+template <class S> void refuse_unless_finite(const char* function, const char* name, const S* values, int index) {
+  const S value = values[index];
+  if (value >= std::numeric_limits<S>::lowest() && value <= std::numeric_limits<S>::max()) return;
+  refuse(function, name, "[", index, "] is ", value, "; it must be finite");
+}
+
+// Of a matrix [4, 4], all columns but one, which nothing reads.
+template <class S> void refuse_unless_finite_but(int column, const char* function, const char* name, const S* matrix) {
+  for (int i = 0; i < 16; ++i) {
+    if (i % 4 != column) refuse_unless_finite(function, name, matrix, i);
+  }
+}
+
+constexpr int kUnreadViewColumn = 3, kUnreadClipColumn = 2;  // (0, 0, 0, 1), and clip z
+
 // Whether the host may read what the pointers of a frame point to: where the camera holds its matrices.
 template <class Frame> constexpr bool kOnHost = !std::is_pointer_v<decltype(Frame::camera.view)>;
 
@@ -57,8 +72,9 @@ template <class S> void refuse_rules(const char* function, const BlendRules<S>& 
 }
 
 inline void refuse_image_size(const char* function, int64_t width, int64_t height) {
-  if (width > 0 && height > 0) return;
-  refuse(function, "image_width x image_height is ", width, " x ", height, "; both must be positive");
+  const auto fits = [](int64_t side) { return side > 0 && side <= kMostImageSide; };
+  if (fits(width) && fits(height)) return;
+  refuse(function, "image_width x image_height is ", width, " x ", height, "; both must be 1 to ", kMostImageSide);
 }
 
 // What every pass reads: the sizes, and what decides which pairs count.
@@ -123,7 +139,12 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
   refuse_negative(function, "near", camera.near);
   refuse_negative(function, "scale_modifier", frame.config.scale_modifier);
   refuse_negative(function, "low_pass", frame.config.low_pass);
-  if constexpr (!kOnHost<Frame>) {
+  if constexpr (kOnHost<Frame>) {
+    refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", camera.view);
+    refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
+    const bool read = frame.inputs.dc != nullptr || frame.inputs.shs != nullptr;
+    for (int i = 0; read && i < 3; ++i) refuse_unless_finite(function, "camera.position (campos)", camera.position, i);
+  } else {
     refuse_null(function, "camera.view", camera.view, "[4, 4]", 1);
     refuse_null(function, "camera.projection", camera.projection, "[4, 4]", 1);
     refuse_null(function, "camera.position", camera.position, "[3]", 1);
@@ -138,6 +159,9 @@ template <class Frame> void refuse_radii(const char* function, const Frame& fram
 template <class Frame> void refuse_images(const char* function, const Frame& frame) {
   const auto& images = frame.images;
   refuse_null(function, "background", frame.config.background, "[C]", 1);
+  for (int i = 0; kOnHost<Frame> && i < frame.config.num_channels; ++i) {
+    refuse_unless_finite(function, "background (bg)", frame.config.background, i);
+  }
   refuse_null(function, "images.color", images.color, "[C, H, W]", 1);
   refuse_null(function, "images.gate_sum", images.gate_sum, "[H, W]", 1);
   refuse_null(function, "images.depth", images.depth, "[H, W], as config.depth is set", frame.config.depth);
@@ -301,6 +325,9 @@ template <class Frame> void refuse_mark_visible(const char* function, const Fram
   const int64_t count = frame.inputs.num_gaussians;
   refuse_null(function, "means3D", frame.inputs.means3D, "[N, 3]", count);
   refuse_null(function, "camera.view", frame.camera.view, "[4, 4]", count);
+  if constexpr (kOnHost<Frame>) {
+    refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", frame.camera.view);
+  }
   refuse_null(function, "visible", visible, "[N]", count);
 }
 

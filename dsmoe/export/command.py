@@ -47,14 +47,23 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
     if form == "spz":
         check_spz()
     trained = open_trained(source, blend_mode, background_gate, device, **options)
-    if os.path.exists(path) and os.path.samefile(path, trained.ply):
+    if os.path.exists(path) and os.path.samefile(path, trained.path):
         raise TrainerError(f"{path} is the model itself; choose another file with -o")
-    if not bake:
+    if not bake and trained.has_ended:
         return path, _write(path, form, trained, sh_degree, overwrite)
     with tempfile.TemporaryDirectory() as folder:
+        if not bake:
+            return path, _write(path, form, _stored(trained, folder), sh_degree, overwrite)
         baked, note = _baked(trained, folder, bake_iterations)
         _write(path, form, baked, sh_degree, overwrite)
     return path, note
+
+
+def _stored(trained: Trained, folder: str) -> Trained:
+    """The model of a checkpoint with a .ply in the folder."""
+    renderer, ply = trained.renderer, os.path.join(folder, "model.ply")
+    save_model(ply, renderer.model, renderer.blend_mode, float(renderer.background_gate))
+    return dataclasses.replace(trained, path=ply)
 
 
 def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str]:
@@ -72,12 +81,12 @@ def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str
     if baked.trained is not None:
         note = (f"test PSNR: {baked.trained:.2f} dB in {name}, {baked.shown:.2f} dB when viewers blend that by alpha, "
                 f"{baked.baked:.2f} dB baked to alpha ({baked.baked - baked.trained:+.2f} dB)")
-    return dataclasses.replace(trained, ply=ply, renderer=baked.renderer), note
+    return dataclasses.replace(trained, path=ply, renderer=baked.renderer), note
 
 
 def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], overwrite: bool) -> str:
     """Writes the file; returns a warning, which may be empty."""
-    gaussians = io.read_gaussians(trained.ply)
+    gaussians = io.read_gaussians(trained.path)
     if sh_degree is not None:
         gaussians = dataclasses.replace(gaussians, shs=gaussians.shs[:, :(sh_degree + 1) ** 2 - 1])
     renderer = trained.renderer
@@ -110,7 +119,7 @@ def _shown(trained: Trained) -> html.Shown:
     renderer = trained.renderer
     red, green, blue = renderer.background.tolist()
     cameras = [trained.cameras[index] for index in evenly_spaced(len(trained.cameras), VIEWS)]
-    title = os.path.basename(os.path.abspath(trained.config.scene or trained.ply))
+    title = os.path.basename(os.path.abspath(trained.config.scene or trained.path))
     return html.Shown(title, renderer.blend_mode, float(renderer.background_gate), (red, green, blue),
                       renderer.antialiasing, cameras, trained.orbit)
 

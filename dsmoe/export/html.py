@@ -17,6 +17,7 @@ from diff_smoe_rasterization.io import Gaussians
 from ..errors import TrainerError
 from ..scenes.cameras import Camera
 from ..scenes.orbit import Orbit
+from ..system.process import command
 from .rows import finite_rows, sigmoid
 
 PAGE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "page")
@@ -45,7 +46,7 @@ def page(gaussians: Gaussians, shown: Shown) -> str:
     """The page's text. Raises TrainerError for a blend mode that it cannot show."""
     if shown.blend_mode not in MODES:
         raise TrainerError(f"a page shows {', '.join(MODES[:-1])} and {MODES[-1]}, but the model was trained with "
-                           f"{shown.blend_mode}; use `dsmoe render` or `dsmoe view`")
+                           f"{shown.blend_mode}; use `{command()} render` or `{command()} view`")
     count, first, second = pack(gaussians)
     facts: Dict[str, Any] = {
         "count": count, "degree": gaussians.sh_degree, "mode": shown.blend_mode, "gate": shown.background_gate,

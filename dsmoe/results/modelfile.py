@@ -15,7 +15,7 @@ from diff_smoe_rasterization.settings import (
 
 from ..errors import TrainerError
 from ..model import GaussianModel, finite_rows
-from ..system.files import is_file, new_file
+from ..system.files import new_file
 
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
 
@@ -30,14 +30,6 @@ class Recorded(NamedTuple):
 def model_path(output: str, iteration: int) -> str:
     """Where a run keeps its Gaussians of that iteration."""
     return os.path.join(output, FOLDER, f"iteration_{iteration}", "point_cloud.ply")
-
-
-def trained_model_path(output: str, iterations: int) -> str:
-    """The .ply that a run of so many iterations ends with. Raises TrainerError where it is not there."""
-    path = model_path(output, iterations)
-    if not is_file(path):
-        raise TrainerError(f"{path}: no such file; the training in {output} has not ended (continue it with --resume)")
-    return path
 
 
 def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:

@@ -1,6 +1,7 @@
 """One image of a GaussianModel through the rasterizer."""
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
 
 import torch
@@ -57,6 +58,12 @@ class Renderer:
         from diff_smoe_rasterization import rasterize_with_splats
 
         return self._render(rasterize_with_splats, camera, background, background_gate, **arguments)
+
+    def of(self, model: GaussianModel, background_gate: BackgroundGate) -> Renderer:
+        """A renderer of another model, with all else as here."""
+        other = copy.copy(self)
+        other.model, other.background_gate = model, background_gate
+        return other
 
     def blend_by(self, blend_mode: str, background_gate: BackgroundGate) -> None:
         """Changes the blend of the images to come."""

@@ -14,6 +14,7 @@ from ..scenes.images import DOWNSCALER
 from ..scenes.scene import Scene
 from ..system.environment import machine, versions
 from ..system.files import is_file, write_json_atomically
+from ..system.process import command
 from .evaluation import Evaluation
 
 RESULTS_NAME = "results.json"
@@ -137,7 +138,7 @@ def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:
     if row["blend_mode"] == "alpha" or row["blend_mode"] == "smoe_eq7" and row.get("background_gate") == 1:
         return ""
     return (f"note: the {row['blend_mode']} .{form} holds gates; viewers of 3DGS blend them by alpha and show another "
-            "image, mostly too dark: use `dsmoe render`")
+            f"image, mostly too dark: use `{command()} render`")
 
 
 def _number(value: Optional[float], digits: int) -> str:

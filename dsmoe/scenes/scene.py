@@ -18,6 +18,7 @@ import numpy as np
 from ..config import IMAGES, TrainConfig
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
+from ..system.process import command
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import MAX_WIDTH, View, fitted_camera, image_size, load_views
@@ -77,7 +78,7 @@ def read_layout(config: TrainConfig) -> Layout:
     else:
         raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
                          "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
-                         "`dsmoe scene PHOTOS -o SCENE` makes a scene")
+                         f"`{command()} scene PHOTOS -o SCENE` makes a scene")
     if layout.kind != "colmap" and config.images != IMAGES:
         raise SceneError(f"scene {folder}: --images is {config.images!r}, which is for a COLMAP scene; "
                          f"{'transforms_train.json' if layout.kind == 'nerf-synthetic' else TRANSFORMS} says where its "

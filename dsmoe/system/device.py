@@ -49,6 +49,14 @@ def chosen_device(asked: Optional[str] = None) -> str:
     return device
 
 
+def device_to_train_on() -> str:
+    """`chosen_device()`, also where nothing is compiled yet: a build for the GPU that torch sees is then to come."""
+    try:
+        return chosen_device()
+    except ImportError:
+        return "cuda" if torch.cuda.is_available() else "cpu"
+
+
 def device_line(device: str) -> str:
     """What a command says first: where it computes, and why a GPU that torch sees is not used."""
     line = f"device: {device} ({machine(device)})"

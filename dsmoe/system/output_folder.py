@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import IO, Collection, Iterator, List, NamedTuple, Optional
 
 from ..errors import TrainerError
-from .files import check_output, is_file, write_json_atomically
+from .files import PART, check_output, is_file, write_json_atomically
 
 try:
     import fcntl
@@ -135,11 +135,21 @@ def own_record(folder: str, command: str, overwrite: bool = False, folders: Coll
     """
     record = read_record(folder, command)
     check_inside(folder, [os.path.join(name, "a") for name in folders])
-    there = sorted({*os.listdir(folder)} - {LOCK_NAME}) if os.path.isdir(folder) else []
-    if record is None and there and not overwrite:
-        raise TrainerError(f"{folder} is not empty ({there[0]}), and nothing says that {command} wrote it; "
-                           "choose a new or empty folder with -o")
+    if record is None and not overwrite:
+        refuse_others(folder, command)
     return record or Record("", [])
+
+
+def refuse_others(folder: str, command: str, remedy: str = "") -> None:
+    """Raises TrainerError where something is in a folder without a record: the command has not written it.
+
+    A lock, or what a killed process has left of a file, is no such thing. remedy: another one, for that error.
+    """
+    there = sorted(name for name in os.listdir(folder) if name != LOCK_NAME and not name.startswith(PART)
+                   ) if os.path.isdir(folder) else []
+    if there:
+        raise TrainerError(f"{folder} is not empty ({there[0]}), and nothing says that {command} wrote it; choose a "
+                           f"new or empty folder with -o{remedy}")
 
 
 def write_record(folder: str, command: str, record: Record, earlier: Collection[str], overwrite: bool = False) -> None:

@@ -31,17 +31,21 @@ def command() -> str:
     script = os.path.join(os.path.dirname(sys.executable), "dsmoe")
     if not os.path.isfile(script):
         return f"{shlex.quote(sys.executable)} -m {__name__.partition('.')[0]}"
-    if shutil.which("dsmoe") == script:
-        return "dsmoe"
-    return shlex.quote(min(script, os.path.relpath(script), key=len))
+    return _typed(script)
 
 
 def pip_install(*packages: str) -> str:
     """What to type to bring packages into the environment that this process runs in."""
     pip = os.path.join(os.path.dirname(sys.executable), "pip")
-    if shutil.which("pip") == pip:
-        return f"pip install {' '.join(packages)}"
-    return f"{shlex.quote(sys.executable)} -m pip install {' '.join(packages)}"
+    typed = _typed(pip) if os.path.isfile(pip) else f"{shlex.quote(sys.executable)} -m pip"
+    return f"{typed} install {' '.join(packages)}"
+
+
+def _typed(script: str) -> str:
+    """The shortest that a shell finds it by: its name, its path from the current folder, or its whole path."""
+    if shutil.which(os.path.basename(script)) == script:
+        return os.path.basename(script)
+    return shlex.quote(min(script, os.path.relpath(script), key=len))
 
 
 def return_spare_memory(device: torch.device) -> None:

@@ -5,18 +5,57 @@ import contextlib
 import json
 import os
 import zipfile
-from typing import Any, Dict, Iterator
+from typing import Any, Dict, Iterator, NamedTuple
 
 import torch
 
+from ..config import CHECKPOINT_NAME, TrainConfig
 from ..errors import TrainerError, out_of_memory
+from ..model import GaussianModel
 from ..system.files import write_atomically
-from .state_check import Misfit
+from .background_gate import LearnedGate
+from .state_check import Misfit, check_model, check_numbers
 
 TENSOR = "__tensor__"  # marks where a tensor was
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
-FORMAT = 5  # raised when the content changes so that older files cannot be resumed
+FORMAT = 6  # raised when the content changes so that older files cannot be resumed
+
+
+class SoFar(NamedTuple):
+    """What a training has made until its checkpoint."""
+
+    path: str
+    model: GaussianModel
+    background_gate: float
+    iteration: int
+    seconds: float  # of training
+
+
+def made_so_far(config: TrainConfig, device: str) -> SoFar:
+    """Reads the checkpoint of the run that config is of. Raises TrainerError, also where it is another run's."""
+    path = os.path.join(config.output, CHECKPOINT_NAME)
+    state = load_checkpoint(path, device)
+    with damage_named(path):
+        there = TrainConfig.of_record(state["config"])
+        for name in ("blend_mode", "background_gate", "sh_degree"):
+            mine, theirs = getattr(config, name), getattr(there, name)
+            if mine != theirs:
+                raise Misfit(f"its `{name}` is {theirs!r}; it must be {mine!r}")
+        check_model(state, config)
+        check_numbers(state)
+        average = state["average"]
+        model = GaussianModel(average or state["raw"], config.sh_degree)
+        model.active_sh_degree = state["active_sh_degree"]
+        if "background_gate" in average:
+            gate = float(average["background_gate"])
+        elif state["gate"] is None:
+            gate = float(config.background_gate)
+        else:
+            learned = LearnedGate(config, device)
+            learned.load_state_dict(state["gate"])
+            gate = float(learned.value)
+        return SoFar(path, model, gate, int(state["iteration"]), float(state["train_seconds"]))
 
 
 def save_checkpoint(path: str, state: Dict[str, Any]) -> None:

@@ -6,8 +6,10 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 """
 from __future__ import annotations
 
+import math
 from typing import Any, Dict, Optional, Tuple
 
+import numpy as np
 import torch
 
 from diff_smoe_rasterization.images import as_float
@@ -26,6 +28,17 @@ GROWTH_ENDS = 8 / 15
 REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
 MOVES_END = 4 / 3
 MOVE_INTERVAL = 1 / 30
+
+# The average begins behind 21,000. Between two of its terms are so many steps, fewer in the shortest runs.
+AVERAGE_BEGINS = 7 / 5
+MOST_BETWEEN_TERMS = 10
+TERMS = 100  # in densify_until_iter, at least, where that has so many steps
+
+# A view needs a Gaussian if its removal costs more than this there: squared colours, summed over pixels.
+NEEDED_COST = 1e-3
+
+NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
+ROWS_AT_ONCE = 2 ** 16  # whose distances to all cameras are in memory
 
 # Growth beyond this many, or beyond twice the budget where that is more, would cost time and memory: no budget above
 # 200,000 was tried with more.
@@ -57,6 +70,10 @@ class ImportanceStrategy(SteadyStrategy):
         self.moves_end = round(MOVES_END * until)
         self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
                       if iteration > self.removals[-1] and self.options.moves > 0]
+        self.average_begins = round(AVERAGE_BEGINS * until)
+        self.between_terms = max(1, min(MOST_BETWEEN_TERMS, until // TERMS))
+        self.average_span = self.options.average * until  # steps
+        self._find_free_space()
         self._check_reach()
 
     def _check_reach(self) -> None:
@@ -70,6 +87,24 @@ class ImportanceStrategy(SteadyStrategy):
                               "points reach with one densification each --densification-interval "
                               f"{config.densification_interval} between --densify-from-iter "
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
+
+    def _find_free_space(self) -> None:
+        """Around each training camera is a ball in which nothing can be, as the points of the scene begin behind it."""
+        points = self.context.model.raw["means3D"].detach()
+        nearest = max(1, int(NEAREST_POINTS * len(points)))
+        centers = np.stack([view.camera.center for view in self.context.views])
+        self.cameras = torch.tensor(centers, dtype=points.dtype, device=points.device)  # [views, 3]
+        begins = [(points - camera).norm(dim=1).kthvalue(nearest).values for camera in self.cameras]
+        self.free_radii = self.options.near * torch.stack(begins)  # [views] world units
+
+    def is_near(self) -> torch.Tensor:
+        """[N] which Gaussians float in front of a training camera.
+
+        They are haze that changes the training views a little, and covers a test view whose camera is closer to them.
+        """
+        parts = self.context.model.raw["means3D"].detach().split(ROWS_AT_ONCE)
+        return torch.cat([((part[:, None] - self.cameras).square().sum(2) < self.free_radii.square()).any(1)
+                          for part in parts])
 
     def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         if iteration <= self.moves_end or self.options.squares == 0:
@@ -89,6 +124,17 @@ class ImportanceStrategy(SteadyStrategy):
             self.remove(1 + sum(later > step.iteration for later in self.removals))
         elif step.iteration in self.moves:
             self.move()
+        behind = step.iteration - self.average_begins
+        if self.average_span > 0 and behind > 0 and behind % self.between_terms == 0:
+            # At first all terms weigh the same, as else the first one would weigh more than others to the end.
+            part = min(1.0, self.between_terms / min(self.average_span, behind))
+            gate = self.context.render.background_gate
+            self.context.optimizer.add_to_average(part, gate if isinstance(gate, torch.Tensor) else None)
+
+    @property
+    def looks(self) -> int:
+        """How many training views a decision looks at."""
+        return min(self.options.views, len(self.context.views))
 
     @property
     def densify_until(self) -> int:
@@ -110,24 +156,33 @@ class ImportanceStrategy(SteadyStrategy):
         return max(min(wanted, max(2 * budget, MOST_OVERSHOOT)), 2 * self.start)
 
     def remove(self, steps_left: int) -> None:
-        """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one."""
+        """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one.
+
+        First go those that float in front of a camera, then those that few views need.
+        """
         model, budget = self.context.model, self.context.config.budget
         if model.num_gaussians <= budget:
             return
         ratio = model.num_gaussians / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
         self._look_at_the_rest()
-        mask = torch.zeros_like(self.costs, dtype=torch.bool)
-        mask[torch.topk(self.costs, kept).indices] = True
+        few = self.needed * len(self.context.views) < self.options.needs * self.looks
+        scores = torch.where(few, -1 / self.costs, self.costs).masked_fill(self.is_near(), -math.inf)
+        mask = torch.zeros_like(few)
+        mask[torch.topk(scores, kept).indices] = True
         self.context.optimizer.keep(mask)
         self._forget_statistics()
 
     def move(self) -> None:
-        """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
+        """Moves the cheapest Gaussians to others, drawn by their error, which are split there.
+
+        Those that float in front of a camera count as free of cost, and no other moves there.
+        """
         self._look_at_the_rest()
         count = int(self.options.moves * len(self.costs))
-        costs, sources = torch.topk(self.costs, count, largest=False)
-        errors = self.errors
+        near = self.is_near()
+        costs, sources = torch.topk(self.costs.masked_fill(near, 0), count, largest=False)
+        errors = self.errors.masked_fill(near, 0)
         self._forget_looks()
         errors[sources] = 0
         count = min(count, int((errors > 0).sum()))
@@ -173,6 +228,7 @@ class ImportanceStrategy(SteadyStrategy):
         weights = None if mask is None else mask[0]
         importance = splats.importance(weights, error if weights is None else weights * error)
         self.costs += importance.removal_costs
+        self.needed += importance.removal_costs > NEEDED_COST
         self.errors += importance.shares
         group = self.sought.get(view.camera.name)
         self.sought = {name: other for name, other in self.sought.items() if other != group}
@@ -192,17 +248,19 @@ class ImportanceStrategy(SteadyStrategy):
         """Begins new sums, [N], for the next decision, which looks at a view of each group of neighbours."""
         self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
         self.errors = torch.zeros_like(self.view_count)  # their squared error where the Gaussian is, by its share
+        self.needed = torch.zeros_like(self.view_count)  # how many of the views need the Gaussian
         views = self.context.views
-        count = min(self.options.views, len(views))
+        count = self.looks
         first = int(torch.randint(len(views), ()))
         # The group of each view, by name. A look at a view takes out its group.
         self.sought = {views[(first + i) % len(views)].camera.name: i * count // len(views) for i in range(len(views))}
 
     def state_dict(self) -> Dict[str, Any]:
         return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
-                "sought": self.sought}
+                "needed": self.needed, "sought": self.sought}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self.start, self.costs, self.errors = state["start"], state["costs"], state["errors"]
+        self.start = state["start"]
+        self.costs, self.errors, self.needed = state["costs"], state["errors"], state["needed"]
         self.sought = dict(state["sought"])

@@ -12,7 +12,7 @@ from ..config import LEARNED, TrainConfig
 from ..model import LARGEST_LOG, PARAMETERS, are_numbers
 
 ROWS = {"means3D": (3,), "dc": (1, 3), "opacities": (1,), "scales": (3,), "rotations": (4,)}  # behind [N]
-CHANGING = ("raw", "optimizer", "strategy", "gate")  # what of a state has tensors that a step changes
+CHANGING = ("raw", "optimizer", "strategy", "gate", "average")  # what of a state has tensors that a step changes
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
 MOST_STEPS = 2**53  # of Adam
 LARGEST_LOGARITHM = 80.0  # whose exponential float32 holds
@@ -100,14 +100,19 @@ def check_model(state: Dict[str, Any], config: TrainConfig) -> None:
         logarithm = float(state["gate"]["logarithm"])
         _require(abs(logarithm) <= LARGEST_LOGARITHM, "gate/logarithm", logarithm,
                  f"between -{LARGEST_LOGARITHM} and {LARGEST_LOGARITHM}")
+    average, names = state["average"], {*PARAMETERS, *(["background_gate"] if state["gate"] else [])}
+    _require(isinstance(average, dict) and set(average) in (set(), names), "average", average,
+             f"empty or the tensors {', '.join(sorted(names))}")
+    for name, tensor in average.items():
+        _check_tensor(f"average/{name}", tensor, raw[name].shape if name in raw else (1,))
 
 
 def check_numbers(state: Dict[str, Any]) -> None:
     """Raises Misfit where a tensor of a state holds what no training has that goes on: NaN, infinities, overflows."""
     for name, tensor in _tensors(state, CHANGING):
         where, _, last = name.rpartition("/")
-        fits, wanted = are_numbers(last, tensor) if where == "raw" else tensor.isfinite(), "finite"
-        if where == "raw" and last == "scales":
+        fits, wanted = are_numbers(last, tensor) if where in ("raw", "average") else tensor.isfinite(), "finite"
+        if where in ("raw", "average") and last == "scales":
             wanted = f"below {LARGEST_LOG}"
         if last == "exp_avg_sq":
             fits, wanted = fits & (tensor >= 0), "finite and not negative"

@@ -90,8 +90,17 @@ class Trainer:
         return self.model.num_gaussians
 
     def whole_model(self) -> Optional[GaussianModel]:
-        """The model with the Gaussians of all processes, where this one leads."""
-        return self.model
+        """The model with the Gaussians of all processes, averaged if the strategy does so, where this one leads."""
+        return self.result().model
+
+    def result(self) -> Renderer:
+        """Renders what the run has found so far: the average of the parameters, where one is kept."""
+        average = self.optimizer.average
+        if not average:
+            return self.renderer
+        model = GaussianModel(average, self.model.sh_degree)
+        model.active_sh_degree = self.model.active_sh_degree
+        return self.renderer.of(model, average.get("background_gate", self.renderer.background_gate))
 
     def stops(self) -> bool:
         """Whether the run is to end behind this step, before its last iteration."""
@@ -161,12 +170,12 @@ class Trainer:
 
     @property
     def background_gate(self) -> float:
-        """The gate as it is now; where it is learned, the host waits for the device."""
-        return float(self.renderer.background_gate)
+        """The gate that the run has found so far; where it is learned, the host waits for the device."""
+        return float(self.optimizer.average.get("background_gate", self.renderer.background_gate))
 
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views."""
-        return evaluate(self.renderer, self.scene.test, self.config.device, progress)
+        return evaluate(self.result(), self.scene.test, self.config.device, progress)
 
     def state_dict(self) -> Dict[str, Any]:
         """Everything the rest of the run depends on, as tensors and plain values."""
@@ -180,6 +189,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "strategy": self.strategy.state_dict(),
             "gate": self.gate.state_dict() if self.gate else None,
+            "average": dict(self.optimizer.average),
             "order": self.order.state_dict(),
             "random": random_state(),
         }
@@ -201,6 +211,7 @@ class Trainer:
         self.optimizer.replace_all(state["raw"])
         self.model.active_sh_degree = state["active_sh_degree"]
         self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.average = dict(state["average"])
         self.strategy.load_state_dict(state["strategy"])
         if self.gate:
             self.gate.load_state_dict(state["gate"])

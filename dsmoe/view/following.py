@@ -4,9 +4,8 @@ from __future__ import annotations
 import os
 from typing import Any, List, Optional, Tuple
 
-from ..config import CHECKPOINT_NAME, LEARNED, TrainConfig
+from ..config import CHECKPOINT_NAME, TrainConfig
 from ..errors import TrainerError
-from ..model import GaussianModel
 from ..opening import Trained, open_trained, places
 from ..results.modelfile import model_path
 from ..results.rendering import Renderer, background_color
@@ -14,8 +13,7 @@ from ..scenes.cameras import Camera
 from ..scenes.orbit import Orbit
 from ..system.device import check_device
 from ..system.files import is_file, is_folder
-from ..training.background_gate import LearnedGate
-from ..training.checkpoint import load_checkpoint
+from ..training.checkpoint import made_so_far
 
 
 class Followed:
@@ -74,18 +72,10 @@ class Followed:
 
     def _take_checkpoint(self, config: TrainConfig) -> None:
         device = self._arguments[-1]
-        state = load_checkpoint(os.path.join(config.output, CHECKPOINT_NAME), device)
-        model = GaussianModel(state["raw"], config.sh_degree)
-        model.active_sh_degree = state["active_sh_degree"]
-        if config.background_gate == LEARNED:
-            learned = LearnedGate(config, device)
-            learned.load_state_dict(state["gate"])
-            gate = float(learned.value)
-        else:
-            gate = float(config.background_gate)
-        renderer = Renderer(model, str(config.blend_mode), background_color(config.white_background, device),
-                            config.antialiasing, background_gate=gate)
+        so_far = made_so_far(config, device)
+        renderer = Renderer(so_far.model, str(config.blend_mode), background_color(config.white_background, device),
+                            config.antialiasing, background_gate=so_far.background_gate)
         if config != self._config:
-            self.cameras, self.orbit = places(config, model, needed="scene" in self._options)
+            self.cameras, self.orbit = places(config, so_far.model, needed="scene" in self._options)
         self.renderer = renderer
-        self.progress = f"training, iteration {state['iteration']:,} of {config.iterations:,}"
+        self.progress = f"training, iteration {so_far.iteration:,} of {config.iterations:,}"

@@ -32,8 +32,12 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
   const std::string last_mode = std::to_string(BlendModes::kSize - 1);
   return {
       {[](auto& f) { f.inputs.num_gaussians = -1; }, "num_gaussians is -1; it must be 0 to 2147483647"},
-      {[](auto& f) { f.camera.width = 0; }, "image_width x image_height is 0 x 29; both must be positive"},
-      {[](auto& f) { f.camera.height = -4; }, "image_width x image_height is 37 x -4; both must be positive"},
+      {[](auto& f) { f.camera.width = 0; }, "image_width x image_height is 0 x 29; both must be 1 to 4194240"},
+      {[](auto& f) { f.camera.width = 4194241; },
+       "image_width x image_height is 4194241 x 29; both must be 1 to 4194240"},
+      {[](auto& f) { f.camera.height = 1 << 22; },
+       "image_width x image_height is 37 x 4194304; both must be 1 to 4194240"},
+      {[](auto& f) { f.camera.height = -4; }, "image_width x image_height is 37 x -4; both must be 1 to 4194240"},
       {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(99); },
        "blend_mode is 99; it must be 0 to " + last_mode},
       {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(-1); },
@@ -86,6 +90,14 @@ TEST(Refuse, AForwardPassOnTheCpuNamesWhatIsWrong) {
   const float negative = -1;
   cases.push_back({[&](Frame& f) { f.config.blend.background_gate_at = &negative; },
                    "background_gate is -1; it must be 0 to 1e+30"});
+  const float background[] = {0, 0, NAN};
+  cases.push_back(
+      {[&](Frame& f) { f.config.background = background; }, "background (bg)[2] is nan; it must be finite"});
+  cases.push_back({[](Frame& f) { f.camera.view[6] = NAN; }, "camera.view (viewmatrix)[6] is nan; it must be finite"});
+  cases.push_back({[](Frame& f) { f.camera.projection[15] = HUGE_VALF; },
+                   "camera.projection (projmatrix)[15] is inf; it must be finite"});
+  cases.push_back(
+      {[](Frame& f) { f.camera.position[1] = NAN; }, "camera.position (campos)[1] is nan; it must be finite"});
   for (const auto& c : cases) {
     Frame frame = frame_of(scene, rendering);
     c.spoil(frame);
@@ -199,6 +211,8 @@ TEST(Refuse, WhatMayBeNullIsNotRefused) {
   cpu::Heap heap;
   EXPECT_NO_THROW(cpu::forward(frame, heap));
   EXPECT_NO_THROW(cpu::backward(frame, {}));
+  frame.camera.view[15] = frame.camera.projection[14] = NAN;  // which nothing reads
+  EXPECT_NO_THROW(cpu::forward(frame, heap));
   frame.images.color = nullptr;  // no gradient by the colour is given
   EXPECT_NO_THROW(cpu::backward(frame, {}));
 

@@ -204,10 +204,14 @@ def test_where_all_gates_are_closed_the_background_takes_pixel_and_gradient(func
 
 @pytest.mark.parametrize("mode", ["smoe_eq7", "smoe_tn", "smoe_std"])
 @pytest.mark.parametrize("background", [math.nan, math.inf])
-def test_without_a_gate_a_background_that_is_no_number_shows_in_empty_pixels_alone(function, mode, background):
+def test_without_a_gate_a_background_that_is_no_number_shows_in_empty_pixels_alone(function, mode, background, device):
     scene = random_scene(mode, 20, 24, 20, scale=0.05, degree=1,
                          bg=torch.full((3,), background, dtype=torch.float64))
     scene = scene.requiring_grad()
+    if function is rasterize and device.type == "cpu":
+        with pytest.raises(ValueError, match=rf"background \(bg\)\[0\] is {background}; it must be finite"):
+            rasterize(settings=scene.settings, **scene.inputs)
+        return
     rendering = function(settings=scene.settings, outputs=("alpha",), **scene.inputs)
     empty = rendering.alpha[0] == 0
     assert torch.equal(torch.isfinite(rendering.color).all(0), ~empty) and empty.any() and not empty.all()
@@ -334,14 +338,3 @@ def test_the_value_of_a_tensor_is_checked_where_nobody_waits_for_it(value, devic
     scene = random_scene("smoe_eq7", 5, 20, 18, background_gate=torch.tensor(value).double())
     with pytest.raises(ValueError, match=f"background_gate is {value}; it must be 0 to 1e\\+30"):
         rasterize(settings=scene.settings, **scene.inputs)
-
-
-@pytest.mark.skipif(not hasattr(torch.library, "register_autograd"),
-                    reason=f"torch {torch.__version__} only refuses what it sees: a loss that is not linear")
-def test_second_derivatives_by_the_gate_are_refused():
-    gate = learned(0.1)
-    scene = random_scene("smoe_eq7", 20, 20, 18, background_gate=gate)
-    first, = torch.autograd.grad(rasterize(settings=scene.settings._replace(background_gate=gate),
-                                           **scene.inputs).color.sum(), gate, create_graph=True)
-    with pytest.raises(RuntimeError, match="rasterize: second derivatives"):
-        first.backward()

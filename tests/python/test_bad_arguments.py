@@ -5,16 +5,22 @@ import re
 
 import pytest
 import torch
-from scenes import camera_settings, random_scene
+from scenes import camera_settings, gradients, random_scene
 
 from diff_smoe_rasterization import (
     DirectRendering,
     GaussianRasterizer,
+    blend_footprints,
+    fused_ssim,
     project_gaussians,
     rasterize,
     rasterize_with_splats,
     visible_radii,
 )
+from diff_smoe_rasterization.autograd import OPTIONS
+from diff_smoe_rasterization.gaussians import activate, add_view
+from diff_smoe_rasterization.losses import l1_ssim_loss
+from diff_smoe_rasterization.settings import FEATURE_OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -121,6 +127,29 @@ def test_a_tensor_on_another_device_is_named():
         render(scene.with_inputs(scales=scene.inputs["scales"].to("meta")))
 
 
+@pytest.mark.parametrize("function", [rasterize, visible_radii, project_gaussians, DirectRendering])
+@pytest.mark.parametrize("layout", ["to_sparse", "to_sparse_csr"])
+@pytest.mark.filterwarnings("ignore:Sparse CSR tensor support")
+def test_a_sparse_tensor_is_named(function, layout):
+    scene = scene_of()
+    inputs = {**scene.inputs, "scales": getattr(scene.inputs["scales"], layout)()}
+    if function is visible_radii:
+        inputs = {name: inputs[name] for name in ("means3D", "scales", "rotations")}
+    words = rf"^{function.__name__}: scales is sparse \(torch.sparse_.*\); it must be dense: scales.to_dense\(\)$"
+    with pytest.raises(TypeError, match=words):
+        function(settings=scene.settings, **inputs)
+
+
+def test_functions_without_settings_refuse_sparse_tensors_and_several_devices():
+    numbers = torch.rand(3, 12, 12)
+    for other, words in ((numbers.to_sparse(), r"is sparse \(torch.sparse_coo\); it must be dense"),
+                         (numbers.to("meta"), r"is on meta; it must be on cpu|is on meta; it must be on cuda:0")):
+        for function, *before in ((fused_ssim, numbers), (l1_ssim_loss, numbers), (activate, numbers, numbers),
+                                  (add_view, numbers, numbers, numbers)):
+            with pytest.raises(TypeError, match=f"^{function.__name__}: .*({words})"):
+                function(*before, other)
+
+
 def test_something_that_is_no_tensor():
     scene = scene_of()
     with pytest.raises(TypeError, match="opacities"):
@@ -135,6 +164,62 @@ def test_something_that_is_no_tensor():
 def test_settings_out_of_range_are_named(field, value):
     with pytest.raises(ValueError, match=rf"{field}.*{value:g}"):
         render(scene_of().with_settings(**{field: value}))
+
+
+NUMBERS = [name for name, kind in OPTIONS.items() if kind is float and name != "fixed_background_gate"]
+FLAGS = [name for name, kind in OPTIONS.items() if kind is bool and name not in (*FEATURE_OUTPUTS, "for_backward")]
+
+
+@pytest.mark.parametrize("field, value, right", [
+    *((name, value, "a number") for name in NUMBERS for value in ("wide", "0.5", 1j, torch.ones(2), 10**400)),
+    *((name, value, "a whole number below 2^63") for name in ("image_height", "image_width", "sh_degree")
+      for value in ("2", None, float("nan"), float("inf"), 10**20, -10**20, torch.ones(2))),
+    *((name, value, "True or False") for name in FLAGS for value in ("False", "", torch.ones(2)))])
+@pytest.mark.parametrize("function", [rasterize, project_gaussians])
+def test_a_setting_that_is_none_of_its_type_is_named(function, field, value, right):
+    scene = scene_of("smoe").with_settings(**{field: value})
+    words = rf"{field} is {re.escape(repr(value))}; it must be {re.escape(right)}"
+    with pytest.raises(ValueError, match=words.replace("a number", "a number.*")):
+        function(settings=scene.settings, **scene.inputs)
+
+
+CAMERA_READS = [("viewmatrix", (1, 2)), ("viewmatrix", (3, 0)), ("projmatrix", (0, 0)), ("projmatrix", (2, 3)),
+                ("campos", (1,)), ("bg", (2,))]
+
+
+@pytest.mark.parametrize("name, place", CAMERA_READS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_a_camera_that_is_not_finite_is_named_where_nobody_waits_for_it(device, name, place, value):
+    if device.type != "cpu":
+        pytest.skip("the host would wait for the GPU")
+    scene = scene_of()
+    broken = getattr(scene.settings, name).clone()
+    broken[place] = value
+    scene = scene.with_settings(**{name: broken})
+    index = place[0] * 4 + place[1] if len(place) == 2 else place[0]
+    words = rf"\({name}\)\[{index}\] is {value:g}; it must be finite"
+    footprints = project_gaussians(settings=scene_of().settings, **scene.inputs)
+    calls = [lambda: render(scene), lambda: project_gaussians(settings=scene.settings, **scene.inputs)]
+    if name == "bg":
+        calls[1] = lambda: blend_footprints(footprints, scene.settings)
+    if name == "viewmatrix":
+        calls += [lambda: GaussianRasterizer(scene.settings).markVisible(scene.inputs["means3D"]),
+                  lambda: visible_radii(scene.inputs["means3D"], scene.settings, scene.inputs["scales"],
+                                        scene.inputs["rotations"])]
+    for call in calls:
+        with pytest.raises(ValueError, match=words):
+            call()
+
+
+def test_numbers_of_a_camera_that_nothing_reads_may_be_nan():
+    scene = scene_of(channels=3)
+    view, projection = (getattr(scene.settings, name).clone() for name in ("viewmatrix", "projmatrix"))
+    view[:, 3] = projection[:, 2] = float("nan")
+    odd = scene.with_settings(viewmatrix=view, projmatrix=projection,
+                              campos=torch.full_like(scene.settings.campos, float("nan")))
+    (image, gradient), (expected, expected_gradient) = (gradients(rasterize, each) for each in (odd, scene))
+    assert torch.equal(image.color, expected.color)
+    assert all(torch.equal(gradient[name], value) for name, value in expected_gradient.items())
 
 
 def test_settings_may_be_whole_numbers_of_any_type():

@@ -118,3 +118,24 @@ def test_what_changes_between_rendering_and_gradients_is_refused(device, name):
         direct.backward(weights, gradients)
     direct.render()
     direct.backward(weights, gradients)
+
+
+def test_what_comes_before_render_is_refused(device):
+    scene = random_scene("smoe", 20, 20, 18, degree=1, dtype=torch.float32)
+    direct = DirectRendering(settings=scene.settings, **scene.inputs)
+    for name, call in (("backward", lambda: direct.backward({}, {})), ("splats", direct.splats)):
+        with pytest.raises(RuntimeError, match=f"^DirectRendering.{name}: nothing is rendered yet; call render first$"):
+            call()
+
+
+@pytest.mark.parametrize("wrong, words", [
+    (lambda image: image.to_sparse(), "is sparse"), (lambda image: image.tolist(), "is of type list"),
+    (lambda image: image.to("meta"), "is on meta")])
+def test_gradients_that_no_op_takes_are_named(device, wrong, words):
+    scene = random_scene("smoe", 20, 20, 18, degree=1, dtype=torch.float32)
+    direct = DirectRendering(settings=scene.settings, **scene.inputs)
+    weight = torch.ones_like(direct.render().color)
+    with pytest.raises(TypeError, match=rf"DirectRendering.backward: dL_dimages\['color'\] {words}"):
+        direct.backward({"color": wrong(weight)}, {})
+    with pytest.raises(TypeError, match=rf"DirectRendering.backward: gradients\['scales'\] {words}"):
+        direct.backward({"color": weight}, {"scales": wrong(scene.inputs["scales"])})

@@ -1,7 +1,7 @@
 """The compiled extension: what it says when it cannot be loaded, and what its ops refuse when called directly."""
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
 import re
 import shutil
@@ -10,10 +10,12 @@ import sys
 import sysconfig
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
+from PIL import Image
 from scenes import op_arguments, op_results, random_scene, with_gate
 
 import diff_smoe_rasterization
@@ -53,7 +55,7 @@ def test_a_package_that_was_not_built_says_what_to_type(copied_package):
         with pytest.raises(ImportError, match="not built.*pip install"):
             getattr(package, name)
     with pytest.raises(ImportError, match="not built.*pip install"):
-        copied_package[1](".io")
+        copied_package[1](".io").read_points("points.ply")
 
 
 def test_settings_and_reference_work_where_nothing_was_built(copied_package):
@@ -103,6 +105,21 @@ def test_the_command_says_in_one_line_that_nothing_was_built(copied_package):
     train = run("train", "scene", "-o", "out", "--blend-mode", "smoe")
     assert train.returncode == 1
     assert re.fullmatch("dsmoe train: error: .*not built.*pip install.*\n", train.stderr)
+    # What computes nothing works without it.
+    checkout = shutil.copytree(Path(__file__).parent / "patches" / "trainer", folder.parent / "trainer")
+    for action in ("check", "apply", "revert"):
+        patch = run("patch", action, checkout)
+        assert patch.returncode == 0, patch.stderr
+    (folder.parent / "other" / "gaussian_renderer").mkdir(parents=True)
+    (folder.parent / "other" / "gaussian_renderer" / "__init__.py").write_text(
+        "from gsplat import rasterization\nrasterization(means=1, rays=None, quality=2)\n")
+    assert "gsplat's rasterization with quality, which" in run("patch", "check", folder.parent / "other").stdout
+    random = np.random.RandomState(0)
+    for index in range(4):
+        Image.fromarray(random.randint(0, 255, (60, 80, 3), np.uint8)).save(folder.parent / f"{index}.png")
+    scene = run("scene", folder.parent, "-o", folder.parent / "scene")
+    reached = "of 4 photographs connect" if importlib.util.find_spec("pycolmap") else r"install pycolmap$"
+    assert scene.returncode == 1 and re.search(reached, scene.stderr, re.MULTILINE), scene.stderr
 
 
 def test_a_build_against_another_torch_names_both_and_says_what_to_type(copied_package):
@@ -315,27 +332,105 @@ def test_the_raw_ops_refuse_absent_tensors(op, name):
         getattr(torch.ops.diff_smoe_rasterization, op)(*arguments)
 
 
+def every_call():
+    """Returns arguments of every op, by the op's name and the argument's, as the package gives them."""
+    scene = random_scene("smoe_learned_gate", 20, 20, 18, degree=1, dtype=torch.float32)
+    images, saved = op_results(scene)
+    blend = op_arguments(scene, "rasterize")
+    gates, features, radii = torch.ops.diff_smoe_rasterization.project(*blend)
+    maps = random_normal((18, 20), 1, torch.float32)
+    kept = {"radii": images["radii"], "saved": list(saved.values())}
+    footprints = {"gates": gates, "features": features, "radii": radii}
+    *blended, blend_saved = torch.ops.diff_smoe_rasterization.blend(*op_arguments(scene, "blend", **footprints))
+    backward = backward_arguments("smoe_learned_gate")
+    image_gradients = {name: value for name, value in backward.items() if name.startswith("dL_d")}
+    inputs = {name: backward[name] for name in ("inputs", "present")}
+    belongs = [here and name not in ("bg", "background_gate") for name, here in zip(_core.inputs, inputs["present"])]
+    depth = random_normal((20,), 1, torch.float32)
+    raw = [random_normal((20, columns), columns, torch.float32) for columns in (3, 1, 3, 4)]
+    values = list(torch.ops.diff_smoe_rasterization.activate(*raw[1:]))
+
+    def alike(tensors=raw):
+        return [torch.ones_like(tensor) for tensor in tensors]
+
+    adam = {"moments": alike(), "squares": alike(), "rates": [0.1] * 4, "root_scales": [1.0] * 4, "beta1": 0.9,
+            "beta2": 0.999, "epsilon": 1e-8}
+    marks, rates = torch.zeros(20, dtype=torch.int32), torch.ones(8, 4, 2)
+    image = random_normal((3, 18, 20), 1, torch.float32)
+    others = {
+        "rasterize": {}, "radii": {}, "project": {}, "blend": footprints, "rasterize_backward": backward,
+        "rasterize_backward_seen": {**backward, "gradients": alike(backward["inputs"])},
+        "blend_backward": {**image_gradients, "images": blended, "saved": blend_saved, "radii": radii,
+                           "wants_background": True},
+        "project_backward": {"records": random_normal((20, 6 + features.shape[1]), 1, torch.float32),
+                             "dL_ddepths": depth, **inputs, "features": features, "radii": radii, "wanted": belongs},
+        "contributions": {"pixel_weights": maps, **kept}, "gate_map": kept,
+        "importance": {"pixel_weights": maps, "share_weights": maps, "color": images["color"],
+                       "gate_sum": images["gate_sum"], **kept},
+        "pack_footprints": {**footprints, "visible": torch.arange(3)},
+        "mark_visible": {"positions": scene.inputs["means3D"]},
+        "adam": {"parameters": alike(), "gradients": alike(), **adam, "visible": torch.ones(20, dtype=torch.bool)},
+        "lazy_adam_catch_up": {"parameters": alike(), "gradients": alike(), **adam, "marks": marks, "rates": rates,
+                               "steps": 1, "radii": radii},
+        "lazy_adam_step": {"marks": marks, "rates": rates, "steps": 1, "new_rates": [0.1] * 4,
+                           "root_scales": [1.0] * 4, "radii": radii},
+        "gaussian_adam": {"raw": alike(), "values": alike(raw[1:]), "dL_dvalues": alike(), **adam, "radii": radii},
+        "gather_rows": {"tensors": raw, "rows": torch.arange(3)},
+        "image_loss": {"image": image, "target": image, "l1_weight": 0.8, "ssim_weight": -0.2, "offset": 0.2,
+                       "margin": 0, "with_gradient": True},
+        "activate": dict(zip(("opacities", "scales", "rotations"), raw[1:])),
+        "activate_backward": {"raw": raw[1:], "values": values,
+                              **dict(zip(("dL_dopacities", "dL_dscales", "dL_drotations"), alike(raw[1:])))},
+        "add_view": {"dL_dmeans2D": raw[0], "radii": radii, "gradient_sum": depth, "view_count": depth.clone()},
+        "mean_squared_neighbour_distances": {"points": raw[0]}}
+    calls = {}
+    for op, given in others.items():
+        names = [each.name for each in getattr(torch.ops.diff_smoe_rasterization, op).default._schema.arguments]
+        calls[op] = dict(zip(names, op_arguments(scene, op, **given)))
+    return calls
+
+
+def names_of_ops():
+    library = "diff_smoe_rasterization::"
+    return sorted(schema.name[len(library):] for schema in torch._C._jit_get_all_schemas()
+                  if schema.name.startswith(library))
+
+
+@on_every_device
+@pytest.mark.parametrize("op", names_of_ops())
+def test_every_op_refuses_tensors_of_several_devices(op, device):
+    """Each tensor in turn lies elsewhere; so does each of a list. By its like on `meta` torch calls the fake op."""
+    function, arguments = getattr(torch.ops.diff_smoe_rasterization, op), every_call()[op]
+    function(*arguments.values())
+    moved = 0
+    for name, value in arguments.items():
+        tensors = value if isinstance(value, list) else [value]
+        for index, tensor in enumerate(tensors):
+            if not isinstance(tensor, torch.Tensor):
+                continue
+            for other in {"meta", "cpu"} - {device.type}:
+                changed = tensors[:index] + [tensor.to(other)] + tensors[index + 1:]
+                given = {**arguments, name: changed if isinstance(value, list) else changed[0]}
+                if sum(isinstance(each, torch.Tensor) for item in given.values()
+                       for each in (item if isinstance(item, list) else [item])) == 1:
+                    continue  # it is the only one
+                with pytest.raises((TypeError, NotImplementedError), match=rf"{op}|meta|Meta"):
+                    function(*given.values())
+                moved += 1
+    assert moved > 0 or op == "mean_squared_neighbour_distances"
+
+
 @on_every_device
 @pytest.mark.parametrize("name, wrong, message", [
     ("tanfovx", 0.0, r"tan_fov_x \(tanfovx\) is 0; it must be positive and finite"),
-    ("image_width", -20, "image_width x image_height is -20 x 18; both must be positive"),
-    ("image_width", 1 << 31, "image_width x image_height is 2147483648 x 18; an image may have 2147483647 pixels"),
+    *((side, size, f"image_width x image_height is {size if side == 'image_width' else 20} x "
+                   f"{18 if side == 'image_width' else size}; both must be 1 to 4194240")
+      for side in ("image_width", "image_height") for size in (-20, 4194241, 1 << 31)),
     ("fixed_background_gate", 2e30, r"background_gate is 2e\+30; it must be 0 to 1e\+30")])
 def test_the_raw_op_refuses_values(name, wrong, message):
     scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
     with pytest.raises(ValueError, match=f"rasterize: {message}"):
         torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene, **{name: wrong}))
-
-
-@on_every_device
-@pytest.mark.skipif(not hasattr(torch.library, "register_autograd"),
-                    reason=f"torch {torch.__version__} only refuses what it sees: a loss that is not linear")
-def test_second_derivatives_of_a_linear_loss_are_refused():
-    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32).requiring_grad()
-    color = rasterize(settings=scene.settings, **scene.inputs).color
-    first, = torch.autograd.grad(color.sum(), scene.inputs["means3D"], create_graph=True)
-    with pytest.raises(RuntimeError, match="rasterize: second derivatives"):
-        first.sum().backward()
 
 
 @on_every_device

@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -231,12 +232,18 @@ def test_the_build_says_how_long_it_takes(monkeypatch):
     said = setup.announcement(["a.cpp"] * 40, ["no GPU was seen"])  # 40 files of 6 s on 2 cores
     assert "40 files, 2 at once, for the CPU: about 2 min (without CUDA: no GPU was seen)" in said
     assert "for CPU and GPU: about 5 min" in setup.announcement(["a.cpp"] * 40 + ["b.cu"] * 18, [])
+    names = [line.split()[1] for line in setup.SECONDS_TO_COMPILE.read_text().splitlines()]
+    there = {path.name for path in (SOURCE / "csrc").rglob("*.c*")}
+    of_today = sum(setup.seconds_of([name for name in names if name in there]))
+    assert of_today > 0.9 * sum(setup.seconds_of(names)), "measure again: build_support/seconds_to_compile"
+    assert setup.seconds_of(["csrc/cpu/tile_kernels_avx2.cpp"]) > setup.seconds_of(["csrc/cpu/heap.cpp"])
 
 
 def environment_sh(folder, commands):
     """What bash prints for these commands after build_support/environment.sh, with a Python that sees no GPU."""
-    (folder / "bin").mkdir()
-    (folder / "bin" / "python").symlink_to("/bin/true")
+    (folder / "bin").mkdir(exist_ok=True)
+    if not (folder / "bin" / "python").exists():
+        (folder / "bin" / "python").symlink_to("/bin/true")
     unset = {name: value for name, value in os.environ.items()
              if name not in ("DSMOE_BUILD_CUDA", "TORCH_CUDA_ARCH_LIST", "DSMOE_VENV")}
     program = f'set -eu; source "{ROOT}/build_support/environment.sh"; venv="{folder}" log="{folder}/log"\n{commands}'
@@ -270,6 +277,69 @@ def test_a_long_step_says_how_many_files_are_compiled(tmp_path):
         step Compiling compile""")
     # Half a second may begin in one second and end in the next.
     assert re.search(r"2 of 3 files compiled \([01] s\)", said) and "9 of" not in said and "... done (" in said, said
+
+
+@pytest.mark.parametrize("log, expected", [
+    # 50 of 72 s are left after 22, of which 2 jobs do 82 in 50 s, with the half minute that is added.
+    ("  cost 20 a.cpp\n  cost 2 b.cpp\n  cost 50 c.cpp\n  [1/4] Building CXX object x/torch/b.cpp.o\n"
+     "  [2/4] Building CXX object x/a.cpp.o\n", "2 of 4 files compiled, 30 s left"),
+    ("cost 400 c.cpp\n[0/2] Re-checking globbed directories...\n", "0 of 2 files compiled, 6 min left"),
+    ("  Downloading https://a/b/torch-2.15.0.whl (539.1 MB)\n  Downloading x.whl.metadata (2 kB)\n",
+     "torch-2.15.0.whl (539.1 MB)"), ("Collecting torch\n", "")])
+def test_a_step_says_how_long_it_takes_by_what_files_cost(tmp_path, log, expected):
+    (tmp_path / "log").write_text(log)
+    assert environment_sh(tmp_path, 'progress 20 2 <"$log"').strip() == expected
+
+
+def wheel_of(folder, version):
+    """A wheel of that version without a file of the package."""
+    name = f"diff_smoe_rasterization-{version}"
+    with zipfile.ZipFile(folder / f"{name}-py3-none-any.whl", "w") as wheel:
+        wheel.writestr(f"{name}.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr(f"{name}.dist-info/METADATA",
+                       f"Metadata-Version: 2.1\nName: diff_smoe_rasterization\nVersion: {version}\n")
+        wheel.writestr(f"{name}.dist-info/RECORD", "")
+
+
+def test_quickstart_takes_a_wheel_that_is_named_and_else_compiles(tmp_path):
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text('#!/bin/sh\n'
+                      'case "$*" in *"import diff_smoe"*) exit "$NOT_LOADED" ;; *"import"*torch*) exit 0 ;; esac\n'
+                      f'exec "{sys.executable}" "$@"\n')
+    python.chmod(0o755)
+    (tmp_path / "bin" / "pip").symlink_to(python)
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+
+    def prepare(takes=wheels, loads=True):
+        said = environment_sh(tmp_path, f"""
+            takes_wheels="{takes}" environment=$venv
+            export NOT_LOADED={int(not loads)}
+            pip_install() {{ echo "$@" >>"$environment/installed"; }}
+            install_package() {{ export NOT_LOADED=0; echo compiled >>"$environment/installed"; }}
+            check_compiler() {{ :; }}
+            prepare_environment "$environment" torch""")
+        installed = tmp_path / "installed"
+        lines = installed.read_text().splitlines() if installed.exists() else []
+        installed.write_text("")
+        return said, lines
+
+    said, lines = prepare()
+    assert "No wheel in" in said and lines[-1] == "compiled"
+    for version in ("0.0.1", f"{diff_smoe_rasterization.__version__}+cpu"):
+        wheel_of(wheels, version)
+    (tmp_path / "dsmoe.stamp").unlink()
+    said, lines = prepare()
+    wheel = f"diff_smoe_rasterization-{diff_smoe_rasterization.__version__}+cpu-py3-none-any.whl"
+    assert "Installing " + wheel in said and lines[0] == "--no-compile torch", "no build tools"
+    assert wheel in lines[1] and wheel in lines[2] and len(lines) == 3
+    assert "nothing has changed" in prepare()[0]
+    assert prepare(takes="")[1][-1] == "compiled", "./check tests what the source says"
+    assert "nothing has changed" in prepare(takes="")[0]
+    (tmp_path / "dsmoe.stamp").unlink()
+    said, lines = prepare(loads=False)
+    assert "does not load with this PyTorch" in said and "ninja" in lines[-2] and lines[-1] == "compiled"
 
 
 def test_a_card_or_a_list_decides_for_which_cards_kernels_are_built(tmp_path, monkeypatch):

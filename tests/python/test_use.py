@@ -1,7 +1,9 @@
 """How programs use the rasterizer beside one plain call: views, no_grad, many calls, second derivatives."""
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 
 import pytest
 import torch
@@ -10,8 +12,20 @@ from devices import random_normal
 from scenes import gradients, op_arguments, random_scene
 from torch.autograd import forward_ad
 
-from diff_smoe_rasterization import fused_ssim, rasterize
+import diff_smoe_rasterization
+from diff_smoe_rasterization import (
+    DirectRendering,
+    Footprints,
+    blend_footprints,
+    fused_ssim,
+    project_gaussians,
+    rasterize,
+    rasterize_with_splats,
+    reference,
+)
+from diff_smoe_rasterization.autograd import _FirstDerivatives
 from diff_smoe_rasterization.gaussians import activate
+from diff_smoe_rasterization.integrations import speedy_splat
 from diff_smoe_rasterization.losses import l1_ssim_loss
 from diff_smoe_rasterization.settings import OUTPUTS
 
@@ -112,12 +126,126 @@ def test_without_gradients(mode, context):
         assert not first.requires_grad and torch.equal(first, second.detach())
 
 
-def test_second_derivatives_are_refused(mode):
-    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32).requiring_grad(camera=False)
-    color = rasterize(settings=scene.settings, **scene.inputs).color
-    with pytest.raises(RuntimeError, match="twice|double|second|once"):
-        first, = torch.autograd.grad((color ** 2).sum(), scene.inputs["means3D"], create_graph=True)
-        first.sum().backward()
+def rendering_leaves(seed=0):
+    scene = random_scene("smoe_learned_gate", 30, 20, 18, degree=1, seed=seed, dtype=torch.float32)
+    scene = scene.requiring_grad()
+    return scene, scene.leaves()
+
+
+def second_of_rasterize():
+    scene, leaves = rendering_leaves()
+    return leaves, rasterize(settings=scene.settings, **scene.inputs).color
+
+
+def second_of_splats():
+    scene, leaves = rendering_leaves()
+    return leaves, rasterize_with_splats(settings=scene.settings, **scene.inputs)[0].color
+
+
+def second_of_projection():
+    scene, leaves = rendering_leaves()
+    footprints = project_gaussians(settings=scene.settings, **scene.inputs).visible()
+    leaves = {name: leaf for name, leaf in leaves.items() if name not in ("bg", "background_gate")}
+    return leaves, footprints.gates.sum() + footprints.features.sum()
+
+
+def second_of_blend():
+    scene, leaves = rendering_leaves()
+    with torch.no_grad():
+        gates, features, radii = project_gaussians(settings=scene.settings, **scene.inputs)
+    leaves = {"gates": gates.requires_grad_(), "features": features.requires_grad_(),
+              **{name: leaves[name] for name in ("bg", "background_gate")}}
+    return leaves, blend_footprints(Footprints(gates, features, radii), scene.settings).color
+
+
+def second_of_halves():
+    scene, leaves = rendering_leaves()
+    return leaves, blend_footprints(project_gaussians(settings=scene.settings, **scene.inputs), scene.settings).color
+
+
+def second_of_activate():
+    leaves = {str(columns): random_normal((7, columns), columns, torch.float32).requires_grad_()
+              for columns in (1, 3, 4)}
+    return leaves, sum(value.sum() for value in activate(*leaves.values()))
+
+
+def second_of_loss(loss):
+    image, target = (random_normal((3, 20, 18), seed, torch.float32) for seed in (1, 2))
+    return {"image": image.requires_grad_()}, loss(image, target)
+
+
+def second_of_scores():
+    scene, leaves = rendering_leaves()
+    scores = torch.zeros(30, 1, requires_grad=True)
+    settings = speedy_splat.GaussianRasterizationSettings(*scene.settings)
+    color = speedy_splat.GaussianRasterizer(settings)(**scene.inputs, scores=scores)[0]
+    return {**leaves, "scores": scores}, color
+
+
+SECOND = {"rasterize": second_of_rasterize, "rasterize_with_splats": second_of_splats,
+          "project_gaussians": second_of_projection, "blend_footprints": second_of_blend, "halves": second_of_halves,
+          "activate": second_of_activate, "l1_ssim_loss": lambda: second_of_loss(l1_ssim_loss),
+          "fused_ssim": lambda: second_of_loss(fused_ssim), "speedy_splat": second_of_scores}
+"""Every function with a gradient: what makes its leaves by name, and its result."""
+
+
+@pytest.mark.parametrize("name", SECOND)
+def test_second_derivatives_are_refused(name):
+    """By each leaf of each gradient, of a loss that is linear in the result, where other terms have a derivative."""
+    leaves, result = SECOND[name]()
+    loss = result.sum() + sum((leaf ** 2).sum() for leaf in leaves.values())
+    firsts = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
+    for by, first in zip(leaves, firsts):
+        for other, leaf in leaves.items():
+            if other == "scores" != by:  # the image does not depend on scores
+                continue
+            with pytest.raises(RuntimeError, match="second derivatives are not implemented"):
+                torch.autograd.grad(first.sum() + (leaf ** 2).sum(), leaf, retain_graph=True)
+    with pytest.raises(RuntimeError, match="second derivatives are not implemented"):
+        sum(first.sum() for first in firsts).backward()
+
+
+def test_second_derivatives_are_tried_of_every_function_with_a_gradient():
+    """Those are the package's autograd.Functions and, by their schemas, the ops with a backward op."""
+    for module in pkgutil.walk_packages(diff_smoe_rasterization.__path__, "diff_smoe_rasterization."):
+        if not module.name.endswith(".libdsmoe"):  # which is a library for C++
+            importlib.import_module(module.name)
+    theirs = {each.__name__ + "Backward" for each in torch.autograd.Function.__subclasses__()
+              if each.__module__.startswith("diff_smoe_rasterization.")
+              and each not in (_FirstDerivatives, reference._PassThroughClamp)}
+    seen = set()
+    for make in SECOND.values():
+        nodes = [make()[1].grad_fn]
+        while nodes:
+            node = nodes.pop()
+            seen.add(node.name())
+            nodes += [each for each, _ in node.next_functions if each is not None]
+    assert theirs and theirs <= seen
+    ops = {schema.name.partition("::")[2] for schema in torch._C._jit_get_all_schemas()
+           if schema.name.startswith("diff_smoe_rasterization::")}
+    assert {op for op in ops if f"{op}_backward" in ops} == {"rasterize", "project", "blend", "activate"}
+
+
+@pytest.mark.skipif(not hasattr(torch, "func"), reason=f"torch {torch.__version__} has no torch.func")
+def test_torch_func_is_refused():
+    scene = random_scene("smoe", 20, 20, 18, degree=1, dtype=torch.float32)
+    image = rasterize(settings=scene.settings, **scene.inputs).color
+
+    def with_means(function):
+        return lambda means: function(settings=scene.settings, **{**scene.inputs, "means3D": means})
+
+    means = scene.inputs["means3D"]
+    functions = {
+        "rasterize": (with_means(lambda **inputs: rasterize(**inputs).color.sum()), means),
+        "project_gaussians": (with_means(lambda **inputs: project_gaussians(**inputs).features.sum()), means),
+        "DirectRendering": (with_means(lambda **inputs: DirectRendering(**inputs).render().color.sum()), means),
+        "activate": (lambda scales: activate(torch.ones(20, 1), scales, scene.inputs["rotations"])[1].sum(),
+                     scene.inputs["scales"]),
+        "SSIM and the image loss": (lambda one: l1_ssim_loss(one, image), image)}
+    for name, (function, value) in functions.items():
+        for transformed, argument in ((torch.func.grad(function), value), (torch.vmap(function), value[None])):
+            with pytest.raises(NotImplementedError, match=rf"{name}: torch.func \(grad, .* is not implemented; take"):
+                transformed(argument)
 
 
 def test_forward_mode_is_refused():

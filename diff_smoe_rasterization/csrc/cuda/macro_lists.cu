@@ -26,6 +26,7 @@ constexpr int kMacroSize = 64;                       // pixels, each way
 constexpr int kMacroTiles = kMacroSize / kTileSize;  // tiles, each way
 constexpr int kTilesPerMacro = kMacroTiles * kMacroTiles;
 constexpr int kSquares = kMacroSize / kWarpTile;  // squares of warps, each way
+static_assert(kMostImageSide <= 0xffff * kMacroSize, "a MacroRect has 16 bits for each of its numbers");
 static_assert(kSquares == 8 && kTileSize == 2 * kWarpTile, "a macro tile's squares are 64 bits, a tile's are four");
 template <class Key> constexpr int kMacroDigit = sizeof(Key) == 2 ? kShortMacroDigit : kLongMacroDigit;
 template <class Key> constexpr int kMacroBins = 1 << kMacroDigit<Key>;

@@ -32,6 +32,8 @@ constexpr double kFrustumMargin = 1.3;        // the Jacobian is taken at most t
 constexpr double kHomogeneousEpsilon = 1e-7;  // added to w before the perspective division
 
 constexpr int kTileSize = 16;  // pixels; also the grid of Inria's tile rectangle
+// Pixels of an image, each way: CUDA's lists have 16 bits for a row or a column of macro tiles of 64 pixels.
+constexpr int kMostImageSide = 65535 * 64;
 
 // Tile and row tests are bounds: every pixel that counts must pass. This is far above their rounding errors, and
 // widens a footprint by less than a hundredth of a pixel at sigma = 1.

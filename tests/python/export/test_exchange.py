@@ -181,7 +181,7 @@ def test_viewers_refuse_a_glb_of_another_blend(export, capsys):
 
 
 def test_smoe_with_the_gate_of_alpha_is_alpha(export, capsys):
-    document, _ = read_glb(export(cloud("smoe", 1.0), "model.glb").read_bytes())
+    document, _ = read_glb(export(cloud("smoe_eq7", 1.0), "model.glb").read_bytes())
     assert document["extensionsUsed"] == [KHR] and "note:" not in capsys.readouterr().out
 
 

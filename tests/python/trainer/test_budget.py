@@ -94,14 +94,15 @@ def test_growth_ends_where_memory_does(tiny_config, budget, goal):
 
 @pytest.mark.parametrize("strategy, killed_at, settings", [
     ("importance", 14, ""), ("importance", 24, ""), ("importance", 24, "removals=4,views=5"), ("importance", 39, ""),
-    ("mcmc", 24, "")])
+    ("importance", 56, ""), ("mcmc", 24, "")])
 def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, strategy, killed_at, settings):
-    """Checkpoints at 10, 20, 30 lie in growth, between removals and among moves.
+    """Checkpoints at 10, 20, 30, 50 lie in growth, between removals, among moves and in the average.
 
     With four removals, at 16, 19, 22 and 25, that at 20 has looked at some of the views of the next one.
     """
     (_, row), _ = killed_and_resumed(tiny_config, tmp_path, killed_at, strategy=strategy, budget=120,
-                                     densification_interval=4, strategy_options=settings)
+                                     densification_interval=4, strategy_options=settings,
+                                     iterations=60 if killed_at > 40 else 40)
     assert row["num_gaussians"] == 120
     recorded = row["protocol"].get("strategy_options")
     assert recorded is None if strategy == "mcmc" else (settings or "removals=16") in recorded
@@ -180,6 +181,8 @@ def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
         cost = sum((a - b).double().square().sum() for a, b in zip(all_of_them, without))
         error = sum((image - view.image_float()).double().square().sum()
                     for image, view in zip(all_of_them, trainer.scene.train))
+        needed = sum(bool((a - b).square().sum() > 1e-3) for a, b in zip(all_of_them, without))
+    assert int(strategy.needed[index]) == needed and 0 < needed <= len(all_of_them)
     # float32 images; a pixel's squared change is of their last digits' size nowhere that matters.
     assert float(strategy.costs[index]) == pytest.approx(float(cost), rel=1e-4)
     assert 0.2 * float(error) < float(strategy.errors.sum()) <= float(error) * (1 + 1e-5)
@@ -187,7 +190,8 @@ def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
 
 def test_rates_of_gate_fall_behind_the_moves(tiny_config):
     """The positions' as ever; the others fall to a tenth from step 40 to the last. The higher bands' is doubled."""
-    config = tiny_config.changed(iterations=80, position_lr_max_steps=80, strategy="importance", budget=60)
+    config = tiny_config.changed(iterations=80, position_lr_max_steps=80, strategy="importance", budget=60,
+                                 strategy_options="anneal=0.1")
     rates_alone = {name: getattr(config, name) for name in ("position_lr_init", "position_lr_final", "feature_lr",
                                                             "scaling_lr")}
     plain, trainer = trainer_of(config, strategy="steady", **rates_alone), trainer_of(config)
@@ -231,6 +235,127 @@ def test_removal_keeps_the_costliest(tiny_config, monkeypatch):
     kept = trainer.model.raw["means3D"][costs >= costs.sort(descending=True).values[59]].detach().clone()
     trainer.strategy.remove(1)
     assert torch.equal(trainer.model.raw["means3D"], kept)
+
+
+def test_removal_first_takes_what_two_views_or_fewer_need(tiny_config):
+    """Of those too the cheapest first. Of fewer views that a decision looks at, as large a part must need it."""
+    for settings, fewest in (("", 3), ("views=4", 2), ("needs=0", 0)):
+        one = trainer_of(tiny_config, strategy="importance", budget=60,
+                         strategy_options=f"{settings}{settings and ','}near=0").strategy
+        assert len(one.context.views) == 7
+        costs = torch.rand(one.context.model.num_gaussians)
+        rows = torch.arange(len(costs))
+        needed = torch.where(rows % 3 == 0, fewest + rows % 2, rows % max(fewest, 1))
+        order = sorted(range(len(costs)), key=lambda i: (int(needed[i]) >= fewest, float(costs[i])))
+        expected = sorted(order[-60:])
+        assert fewest == 0 or 60 > (needed >= fewest).sum() > 10, "some of what few views need stays"
+        one.costs, one.needed, one.sought = costs, needed.float(), {}
+        before = one.context.model.raw["means3D"].detach().clone()
+        one.remove(1)
+        assert torch.equal(one.context.model.raw["means3D"], before[expected])
+
+
+def floating(trainer, rows):
+    """Puts Gaussians a little nearer to a camera each than half the distance behind which its points begin, and one a
+    little farther away. Returns that one."""
+    raw, views = trainer.model.raw, trainer.scene.train
+    points = raw["means3D"].detach().clone()
+    with torch.no_grad():
+        for index, (row, part) in enumerate(zip([*rows, 0], [0.49] * len(rows) + [0.52])):
+            center = torch.tensor(views[index % len(views)].camera.center, dtype=torch.float32)
+            distances, order = (points - center).norm(dim=1).sort()
+            begins = distances[max(1, len(points) // 100) - 1]
+            direction = points[order[-1]] - center
+            raw["means3D"][row] = center + part * begins * direction / direction.norm()
+    return 0
+
+
+def test_removal_takes_what_floats_in_front_of_a_camera(tiny_config, monkeypatch):
+    """Whatever it costs; not what is a little farther away."""
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
+    strategy = trainer.strategy
+    border = floating(trainer, [20, 50, 70])
+    assert strategy.is_near().nonzero().squeeze(1).tolist() == [20, 50, 70]
+    strategy.costs, strategy.sought = 1.0 + torch.arange(trainer.model.num_gaussians), {}
+    strategy.costs[[20, 50, 70, border]] = 1e6
+    strategy.needed += len(trainer.scene.train)
+    means = trainer.model.raw["means3D"].detach().clone()
+    strategy.remove(1)
+    expected = sorted([border, *range(len(means) - 59, len(means))])
+    assert torch.equal(trainer.model.raw["means3D"], means[expected])
+
+
+def test_what_floats_in_front_of_a_camera_moves(tiny_config, monkeypatch):
+    """Whatever it costs, and nothing moves there; in parts of the Gaussians as at once."""
+    monkeypatch.setattr("dsmoe.training.importance_strategy.ROWS_AT_ONCE", 9)
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
+    strategy, count = trainer.strategy, trainer.model.num_gaussians
+    floating(trainer, [20, 50])
+    strategy.costs, strategy.errors, strategy.sought = torch.full((count,), 5.0), torch.zeros(count), {}
+    strategy.costs[20], strategy.errors[[3, 50]] = 1e6, torch.tensor([10.0, 1e6])
+    moved = []
+    monkeypatch.setattr(strategy, "split", lambda parents, places: moved.append((parents.tolist(), places.tolist())))
+    strategy.move()
+    assert moved[0][0] == [3] and moved[0][1][0] in (20, 50)
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_the_model_is_an_average_of_the_last_part(tiny_config, mode):
+    """Behind step 42 of 60 of each step: of the first four the mean, then a quarter of each further one."""
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60, iterations=60, blend_mode=mode,
+                         strategy_options="average=0.14")
+    terms = []
+    while trainer.iteration < 60:
+        trainer.step()
+        assert bool(trainer.optimizer.average) == (trainer.iteration > 42)
+        if 42 < trainer.iteration < 60:
+            terms.append({**{name: tensor.detach().clone() for name, tensor in trainer.model.raw.items()},
+                          "background_gate": torch.as_tensor(float(trainer.renderer.background_gate)).reshape(1)})
+    average = trainer.optimizer.average
+    names = {*trainer.model.stored, *(["background_gate"] if mode == "smoe" else [])}
+    assert len(terms) == 17 and set(average) == names
+    weights = [1 / 4] * 4
+    for _ in terms[4:]:
+        weights = [weight * (1 - 1 / 4.2) for weight in weights] + [1 / 4.2]
+    for name, tensor in average.items():
+        expected = sum(weight * term[name].double() for weight, term in zip(weights, terms))
+        torch.testing.assert_close(tensor.double(), expected, rtol=1e-5, atol=1e-6)  # 17 roundings of float32
+    shown = trainer.result()
+    assert torch.equal(trainer.whole_model().raw["scales"], average["scales"])
+    assert not torch.equal(trainer.model.raw["scales"], average["scales"])
+    assert trainer.background_gate == float(average.get("background_gate", trainer.renderer.background_gate))
+    assert shown.model.active_sh_degree == trainer.model.active_sh_degree
+    view = trainer.scene.test[0]
+    with torch.no_grad():
+        mean_squared = (shown(view.camera).color.clamp(0, 1) - view.image_float()).double().square().mean()
+    evaluation = trainer.evaluate()
+    assert evaluation.per_view[0]["psnr_float"] == pytest.approx(-10 * math.log10(mean_squared), abs=1e-3)
+
+
+def test_an_average_follows_the_gaussians(tiny_config):
+    """What is removed leaves it; what is moved, or is new, begins it anew; the rest stays."""
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
+    optimizer, raw = trainer.optimizer, trainer.model.raw
+    trainer.step()
+    optimizer.add_to_average(0.5)
+    with torch.no_grad():
+        for tensor in raw.values():
+            tensor += 1
+    before = {name: tensor.clone() for name, tensor in optimizer.average.items()}
+    with torch.no_grad():
+        trainer.strategy.split(torch.tensor([5]), torch.tensor([9]))
+        count = trainer.model.num_gaussians
+        rows = torch.cat([torch.arange(2, count), torch.tensor([3, 4])])
+        optimizer.take(rows, {"scales": trainer.model.raw["scales"].detach()[[3, 4]] + 1})
+    raw, others = trainer.model.raw, [row - 2 for row in range(2, count) if row not in (5, 9)]
+    for name, average in optimizer.average.items():
+        assert torch.equal(average[others], before[name][2:][others])
+        new = [3, 7, count - 2, count - 1]
+        if name == "scales":
+            assert torch.equal(average[new], raw[name][new])
+        else:
+            assert torch.equal(average[new[:2]], raw[name][new[:2]])
+            assert torch.equal(average[new[2:]], before[name][[3, 4]]), "a copy has its parent's"
 
 
 def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
@@ -325,6 +450,8 @@ def test_what_cannot_be_is_said(options, words):
     ("overshoot=0.5", "overshoot is 0.5; it must be 0 or at least 1"),
     ("overshoot=inf", "overshoot is 'inf'; it must be a finite number, 0 or at least 1"),
     ("views=1, views=2", "views stands there twice"),
+    ("near=-1", "near is -1; it must be between 0 and 1"), ("needs=-1", "needs is -1; it must be at least 0"),
+    ("average=-1", "average is -1; it must be at least 0"),
     ("worth=-1", "worth is -1; it must be at least 0"), ("anneal=0", "anneal is 0; it must be above 0"),
     ("bands=0", "bands is 0; it must be above 0"), ("squares=-1", "squares is -1; it must be at least 0")])
 def test_settings_of_gate_are_checked(text, words):
@@ -333,7 +460,7 @@ def test_settings_of_gate_are_checked(text, words):
 
 
 def test_settings_of_gate_are_of_gate_only():
-    text = "overshoot=0,removals=1,views=1000000,moves=0,worth=0,bands=1,anneal=0.5,squares=0"
+    text = "overshoot=0,removals=1,views=1000000,moves=0,worth=0,bands=1,needs=0,near=0,anneal=0.5,squares=0,average=0"
     assert TrainConfig(budget=60, strategy_options=text.replace(",", ", ")).validate()
     assert importance_settings(parse_importance_options(text)) == text
     with pytest.raises(ConfigError, match="--strategy-options is 'views=3'; it must be left out with --strategy mcmc"):

@@ -22,9 +22,11 @@ from dsmoe import inspection
 from dsmoe.cli import main
 from dsmoe.config import TrainConfig
 from dsmoe.config_arguments import GROUPS
+from dsmoe.results.modelfile import load_model
 from dsmoe.results.rows import viewer_warning
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training import forecast
+from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
 from dsmoe.training.trainer import Trainer
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
@@ -200,6 +202,30 @@ def test_what_cannot_be_read_is_not_called_missing(trained, scene, tmp_path, cap
     os.remove(os.path.join(resumed, "checkpoint.pt"))
     os.symlink(loop, os.path.join(resumed, "checkpoint.pt"))
     assert "checkpoint.pt: cannot be read" in fails(capsys, "train", "--resume", "-o", resumed)
+
+
+def test_train_writes_into_no_folder_of_others(scene, tmp_path, capsys):
+    photographs = tmp_path / "photos"
+    shutil.copytree(os.path.join(scene, "images"), str(photographs))
+    before = {path.name: path.read_bytes() for path in photographs.iterdir()}
+    words = ["train", scene, "-o", str(photographs), *SHORT]
+    text = fails(capsys, *words)
+    assert f"{photographs} is not empty (view_000.png), and nothing says that dsmoe train wrote it" in text
+    assert "choose a new or empty folder with -o; --overwrite trains beside what is there" in text
+    assert "is not empty (view_000.png)" in fails(capsys, *words, "--resume")
+    assert before == {path.name: path.read_bytes() for path in photographs.iterdir()}
+    assert main([*words, "--overwrite"]) == 0
+    assert main([*words, "--overwrite"]) == 0 and main([*words, "--resume"]) == 0
+    assert before == {name: (photographs / name).read_bytes() for name in before}
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    for name in (".dsmoe.lock", f".dsmoe_part-{ended.pid}-.dsmoe.json"):
+        (killed / name).write_text("")
+    for command in (["train", scene, *SHORT], ["render", str(photographs)]):
+        folder = shutil.copytree(killed, tmp_path / command[0])
+        assert main([*command, "-o", str(folder)]) == 0, "what a run leaves that is killed at once is in nobody's way"
 
 
 def test_render_writes_into_its_own_folder_alone(trained, scene, tmp_path, capsys):
@@ -693,11 +719,61 @@ def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monke
     assert capsys.readouterr().err.endswith("interrupted\n")
 
 
-def test_an_unfinished_run_cannot_be_evaluated(trained, tmp_path, capsys):
+@pytest.mark.parametrize("mode", ["smoe", "alpha"])
+def test_an_interrupted_training_is_looked_at_by_its_checkpoint(scene, tmp_path, monkeypatch, capsys, ctrl_c_works,
+                                                                mode):
+    run = str(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 7, signal.SIGINT)
+        assert main(["train", scene, "-o", run, *SHORT, "--blend-mode", mode]) == 130
+    before = {path for path, _, _ in os.walk(run)}, sorted(os.listdir(run))
+    state = load_checkpoint(os.path.join(run, "checkpoint.pt"), "cpu")
+    note = f"note: the training in {run} has not ended; this is its checkpoint, at iteration 7 of 12\n"
+    commands = {"eval": [run], "render": [run, "-o", str(tmp_path / "images")],
+                "export": [run, "-o", str(tmp_path / "model.ply")]}
+    for command, words in commands.items():
+        capsys.readouterr()
+        assert main([command, *words]) == 0
+        said = capsys.readouterr()
+        assert said.err == note, command
+        if command == "eval":
+            psnr = float(re.search(r"\n\w+(?: [\d.]+)? +([\d.]+) ", said.out.split("---")[-1]).group(1))
+    assert before == ({path for path, _, _ in os.walk(run)}, sorted(os.listdir(run))), "no results of half a training"
+    model, recorded = load_model(str(tmp_path / "model.ply"), "cpu")
+    assert recorded.blend_mode == mode and torch.equal(model.raw["means3D"], state["raw"]["means3D"])
+    if state["gate"]:
+        assert recorded.background_gate == pytest.approx(float(state["gate"]["logarithm"].exp()), rel=1e-6)
+    errors = [np.asarray(Image.open(tmp_path / "images" / name), float)
+              - np.asarray(Image.open(os.path.join(scene, "images", name)), float)
+              for name in ("view_000.png", "view_008.png")]
+    assert np.mean([10 * np.log10(255**2 / (error**2).mean()) for error in errors]) == pytest.approx(psnr, abs=0.006)
+    assert main(["render", run, "--orbit", "--frames", "1", "-o", str(tmp_path / "orbit")]) == 0
+    assert main(["export", run, "-o", str(tmp_path / "model.html")]) == 0
+    words = {"smoe": "was trained with the background gate", "alpha": "in the blend mode alpha it is 1"}[mode]
+    assert words in fails(capsys, "export", run, "-o", str(tmp_path / "a.html"), "--background-gate", "0.7")
+    assert main(["train", "--resume", run, "--quiet"]) == 0
+    capsys.readouterr()
+    assert main(["eval", run]) == 0 and capsys.readouterr().err == ""
+
+
+def test_what_of_an_unfinished_run_cannot_be_looked_at_is_named(trained, tmp_path, capsys):
     run = str(tmp_path / "run")
     shutil.copytree(trained, run)
     os.remove(ply_of(run))
-    assert "has not ended" in fails(capsys, "eval", run)
+    path = os.path.join(run, "checkpoint.pt")
+    state = load_checkpoint(path, "cpu")
+    state["raw"]["means3D"][3, 1] = float("nan")
+    commands = (["eval", run], ["render", run, "-o", str(tmp_path / "images")],
+                ["export", run, "-o", str(tmp_path / "model.html")])
+    for edit, words in ((lambda: save_checkpoint(path, state), "`raw/means3D` is NaN"),
+                        (lambda: save_checkpoint(path, {**state, "raw": {}}), "its `raw` is []"),
+                        (lambda: edit_config(run, sh_degree=2), "its `sh_degree` is 3; it must be 2"),
+                        (lambda: os.truncate(path, 1000), "not a readable checkpoint"),
+                        (lambda: os.remove(path), "has not ended, and has no checkpoint yet")):
+        edit()
+        for command in commands:
+            assert words in fails(capsys, *command)
+    assert sorted(os.listdir(tmp_path)) == ["run"]
 
 
 def test_scale_recipe(scene, tmp_path):

@@ -9,8 +9,9 @@ import torch
 
 from dsmoe.cli import main
 from dsmoe.errors import TrainerError
+from dsmoe.short_run import short_flags, train_command
 from dsmoe.system import device
-from dsmoe.system.device import chosen_device, device_line
+from dsmoe.system.device import chosen_device, device_line, device_to_train_on
 
 
 @pytest.fixture
@@ -46,6 +47,26 @@ def test_auto_is_the_cpu_elsewhere(machine):
     assert chosen_device() == "cpu" and "GPU" not in device_line("cpu")
     with pytest.raises(TrainerError, match="torch finds no CUDA device"):
         chosen_device("cuda")
+
+
+def test_a_build_that_is_to_come_counts_as_one_for_the_gpu_that_torch_sees(machine, monkeypatch):
+    def not_built():
+        raise ImportError
+
+    for gpu, expected in ((True, "cuda"), (False, "cpu")):
+        machine(gpu=gpu)
+        monkeypatch.setattr(device, "extension_info", not_built)
+        assert device_to_train_on() == expected
+
+
+def test_what_to_type_has_the_short_options_on_a_processor():
+    assert short_flags() == "--iterations 3000 --scale-recipe --resolution 4"
+    for size, divisor in (((600, 400), ""), ((601, 400), " --resolution 2"), ((1600, 1200), " --resolution 4"),
+                          ((4000, 3000), " --resolution 8"), ((9000, 6000), " --resolution 8")):
+        assert short_flags(*size) == "--iterations 3000 --scale-recipe" + divisor
+    assert train_command("my scene", "OUT", "cpu", 320, 240).endswith(
+        " train 'my scene' -o OUT --iterations 3000 --scale-recipe")
+    assert train_command("scene", "OUT", "cuda", 320, 240).endswith(" train scene -o OUT")
 
 
 def test_commands_say_their_device_first(tiny_scene, tmp_path, capsys, monkeypatch):

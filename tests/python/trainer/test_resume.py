@@ -530,6 +530,9 @@ ALTERATIONS = [
     ("strategy/gradient_sum", lambda rows: torch.stack([rows, rows], -1)[..., 0]),
     ("optimizer/dc/exp_avg", lambda rows: rows[:1].expand_as(rows)), ("strategy/gradient_sum", lambda rows: rows.int()),
     ("strategy/gradient_sum", None), ("strategy", None),
+    ("average", None), ("average", {"dc": torch.ones(3)}), ("average", lambda _: {"background_gate": torch.ones(1)}),
+    ("average/dc", lambda rows: rows[1:]), ("average/scales", lambda rows: rows + 1e3),
+    ("average/shs", lambda rows: rows / 0), ("average/background_gate", torch.ones(2)),
     ("gate", None), ("gate/logarithm", torch.ones(2)), ("gate/logarithm", 1.0),
     ("gate/logarithm", torch.full((1,), float("nan"))), ("gate/logarithm", torch.full((1,), 1e3)),
     ("gate/adam/exp_avg", torch.ones(2)), ("gate/adam/exp_avg", [0.0]), ("gate/adam/step", "1"),
@@ -552,6 +555,8 @@ def test_a_checkpoint_that_is_no_state_of_the_run_is_named_and_not_begun_with(ti
     state = load_checkpoint(path, "cpu")
     run = runs.Run(Trainer(config, load_scene(config, progress=False)), progress=False)
     monkeypatch.setattr(run.trainer, "load_state_dict", begun.append)
+    state["average"] = {"background_gate": torch.ones(1), **{name: rows.clone() for name, rows in state["raw"].items()}}
+    save_checkpoint(path, state)
     assert run.resume() and len(begun) == 1 and state["gate"]["adam"]
     for place, value in ALTERATIONS:
         save_checkpoint(path, altered(state, place, value))

@@ -123,6 +123,12 @@ def test_a_training_is_followed_to_its_end(tiny_scene, tmp_path):  # noqa: F811
     assert followed.progress == "training, iteration 1 of 6" and not followed.poll()
     assert float(followed.renderer.background_gate) == pytest.approx(run.trainer.background_gate)
     first = followed.renderer.model.raw["means3D"].detach().clone()
+    run.trainer.optimizer.add_to_average(1.0, torch.ones(1))
+    run.trainer.optimizer.average["means3D"] += 1
+    run.save_checkpoint()
+    assert followed.poll() and float(followed.renderer.background_gate) == 1
+    torch.testing.assert_close(followed.renderer.model.raw["means3D"].detach(), first + 1)
+    run.trainer.optimizer.average = {}
     os.rename(config.output + "/checkpoint.pt", config.output + "/away")
     with pytest.raises(ValueError, match="no such file yet"):
         followed.poll()
