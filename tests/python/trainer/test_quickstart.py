@@ -167,7 +167,8 @@ def test_an_output_that_is_a_file_is_one_line(tiny_scene, tmp_path, capsys):
 def test_without_a_scene_one_is_made(tmp_path, monkeypatch, capsys):
     make = quickstart.write_synthetic_scene
     monkeypatch.setattr(quickstart, "write_synthetic_scene",
-                        lambda folder, progress: make(folder, views=9, width=32, height=24, points=150, supersampling=1))
+                        lambda folder, progress: make(folder, views=9, width=32, height=24, points=150,
+                                                       supersampling=1))
     assert quickstart.main(["-o", str(tmp_path), "--iterations", "12", "--quiet"]) == 0
     assert "making a scene" in capsys.readouterr().out
     assert (tmp_path / "scene" / "images" / "view_003.png").is_file() and (tmp_path / "smoe.ply").is_file()
