@@ -163,12 +163,13 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
     """Says what to do with a checkout that no patch fits."""
     if not facts.calls_some(found) and not facts.importers(files):
-        return "name the folder in which train.py lies; a script elsewhere that calls a rasterizer is run by `dsmoe run`"
+        return "name the folder in which train.py lies; `dsmoe run` runs a script that calls a rasterizer from elsewhere"
     if facts.those(found, "uses ") or "from " + facts.OF_GSPLAT in found:
         return (f"neither a patch nor `dsmoe run` can stand in for that; an import of {INTEGRATIONS} in its code can: "
                 "integrations/README.md lists their APIs")
-    return (f"no patch fits; {_by_run(files).replace('smoe --', 'smoe --trainer NAME --')}. NAME is the rasterizer whose "
-            "API it calls (`list` prints all), or the order of its results, such as color,depth,radii")
+    by_run = _by_run(files).replace("smoe --", "smoe --trainer NAME --")
+    return (f"no patch fits; {by_run}. NAME is the rasterizer whose API it calls (`list` prints all), or "
+            "the order of its results, such as color,depth,radii")
 
 
 def _by_run(files: Mapping[str, bytes]) -> str:
