@@ -163,7 +163,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
     """Says what to do with a checkout that no patch fits."""
     if not facts.calls_some(found) and not facts.importers(files):
-        return "name the folder in which train.py lies; `dsmoe run` runs a script that calls a rasterizer from elsewhere"
+        return "name the folder in which train.py lies; `dsmoe run` runs a script of any other folder"
     if facts.those(found, "uses ") or "from " + facts.OF_GSPLAT in found:
         return (f"neither a patch nor `dsmoe run` can stand in for that; an import of {INTEGRATIONS} in its code can: "
                 "integrations/README.md lists their APIs")
