@@ -7,7 +7,7 @@ from typing import Iterator, List, Tuple
 from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.settings import BLEND_MODES
 
-from . import choices
+from . import choices, fast
 from .bench.names import SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
 from .config import DEVICES, PRINCIPAL_POINTS
@@ -17,6 +17,7 @@ from .patches import TRAINERS
 TRAIN_EXAMPLES = """examples:
   dsmoe train garden -o garden_model                              the recipe of 3DGS
   dsmoe train garden -o small --blend-mode smoe --budget 30000    a model of 30,000 Gaussians
+  dsmoe train garden -o fast --blend-mode smoe --fast             a result in seconds
   dsmoe train garden -o quick --iterations 3000 --scale-recipe --resolution 4    minutes on a processor"""
 
 
@@ -40,6 +41,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--scale-recipe", action="store_true",
         help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
              "keep their share of 30,000 steps, unless they are given")
+    groups["length, and number of Gaussians"].add_argument(
+        "--fast", action="store_true",
+        help=f"a result in seconds on a GPU: {fast.ITERATIONS} iterations of the strategy importance, with early "
+             f"milestones; without --budget {fast.PER_POINT} Gaussians for each point of the scene, {fast.LEAST} to "
+             f"{fast.MOST}. Options that are given win")
     earlier_run = groups["run"].add_mutually_exclusive_group()
     earlier_run.add_argument("--resume", action="store_true",
                              help="continue the run in OUT from its last checkpoint with its own options; more "

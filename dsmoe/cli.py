@@ -191,15 +191,16 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
         del arguments.scene
     if "output" not in given or "scene" not in given and not arguments.resume:
         arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs only OUT")
-    if arguments.resume and arguments.scale_recipe and "scene" not in given:
-        arguments.command_parser.error("--scale-recipe needs SCENE; --resume alone keeps the run's milestones")
+    presets = ["--fast"] * arguments.fast + ["--scale-recipe"] * arguments.scale_recipe
+    if arguments.resume and presets and "scene" not in given:
+        arguments.command_parser.error(f"{presets[0]} needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")
     if given.get("device", "auto") == "auto":
         from .system.device import chosen_device
 
         earlier = TrainConfig.load(run).device if arguments.resume and holds_run(run) else None
         given["device"] = arguments.device = earlier or chosen_device()
-    if not arguments.resume or "scene" in given and (arguments.scale_recipe or not holds_run(run)):
+    if not arguments.resume or "scene" in given and (presets or not holds_run(run)):
         return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
 

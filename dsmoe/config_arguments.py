@@ -9,6 +9,7 @@ from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MOD
 
 from .config import LEARNED, TrainConfig, flags_of, learned_gate_of
 from .errors import ConfigError
+from .fast import budget_of, with_preset
 
 # How `--help` groups the options; those that no group names are of the last one.
 GROUPS = {
@@ -75,16 +76,21 @@ def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
 def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
     """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
 
-    With --scale-recipe the milestones that are not given keep their share of the iterations. earlier: the run that goes
-    on with these options.
+    With --scale-recipe the milestones that are not given keep their share of the iterations; --fast is a preset that
+    does so too. earlier: the run that goes on with these options.
     """
-    options = given_options(arguments)
+    given = options = given_options(arguments)
+    fast = getattr(arguments, "fast", False)
+    if fast:
+        options = with_preset(given)
     config = TrainConfig(**options)
-    if getattr(arguments, "scale_recipe", False):
+    if fast or getattr(arguments, "scale_recipe", False):
         config = dataclasses.replace(config.shortened(), **options)
+    if fast and "budget" not in given:
+        config = dataclasses.replace(config, budget=earlier.budget if earlier else budget_of(config))
     if earlier:
         earlier.check_continued_by(config)
-    _check_learned(config, options)
+    _check_learned(config, given)
     return config.validate()
 
 

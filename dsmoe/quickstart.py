@@ -21,7 +21,7 @@ from .inspection import open_renderer, to_image
 from .results.metrics import psnr, quantised
 from .results.modelfile import model_path
 from .results.pictures import comparison, evenly_spaced, file_names
-from .results.rows import RESULTS_NAME, results_table, viewer_warning, write_results
+from .results.rows import RESULTS_NAME, blend_name, results_table, viewer_warning, write_results
 from .scenes.images import View, image_size
 from .scenes.scene import Scene, load_scene, read_layout
 from .scenes.synthetic import write_synthetic_scene
@@ -95,9 +95,10 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
         earlier = _earlier_files(output, subject)  # again: another run may have been at work there
         if config is None:
             folder = os.path.join(output, "scene")
-            print(f"making a scene in {folder}", flush=True)
+            print(f"making a scene in {folder}: a room, ray-traced", flush=True)
             write_record(output, PROGRAM, Record(subject, earlier), earlier)  # the scene is its own
-            write_synthetic_scene(folder, **({} if given["device"] == "cpu" else MADE_UP_ON_GPU))
+            write_synthetic_scene(folder, progress=progress,
+                                  **({} if given["device"] == "cpu" else MADE_UP_ON_GPU))
             config = choose_options(folder, given)
         set_up_process(config.device)
         scene = load_scene(config, progress)
@@ -182,7 +183,9 @@ def write_pictures(config: TrainConfig, views: Dict[str, View], output: str) -> 
         for mode, renderer in renderers:
             with torch.no_grad():
                 color = renderer(view.camera).color.cpu()
-            labelled.append((f"{mode}  {psnr(quantised(color), truth, mask):.2f} dB", to_image(color)))
+            blend = blend_name(mode, float(renderer.background_gate))
+            labelled.append((f"{blend}  {psnr(quantised(color), truth, mask):.2f} dB  "
+                             f"{renderer.model.num_gaussians:,} Gaussians", to_image(color)))
         paths.append(os.path.join(output, name))
         comparison(to_image(truth), labelled).save(paths[-1])
     return paths

@@ -13,7 +13,7 @@ import shutil
 import tempfile
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Union
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Set, Union
 
 from . import facts
 from .rules import OPTIONS, SETTINGS, entries_in, import_rasterizer, rules_of, settings_blend, start
@@ -142,7 +142,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     elif GR not in now:
         reason, chosen = f"there is no {GR} in it", None
     if chosen is None or facts.those(found, "uses "):
-        return Plan(root, "unknown", None, [reason], applied)
+        instead = [] if "type `dsmoe run" in reason or below else [_instead(before, found)]
+        return Plan(root, "unknown", None, [reason, *instead], applied)
     wanted = {"modernise": modernise, "fuse": fuse}
     options = [name for name in OPTIONS if wanted[name] or name in applied]
     sparse_adam = facts.is_for_sparse_adam(root, before, found)
@@ -157,6 +158,18 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         reason = f"by what it imports and calls it is {known.name}, which has another API" if known else reason
         patched.notes.insert(0, f"--trainer {trainer}: {reason}")
     return Plan(root, state, chosen.name, reasons, applied, now, before, patched.after, patched.rules, patched.notes)
+
+
+def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
+    """Says what to do with a checkout that no patch fits."""
+    if not facts.calls_some(found) and not facts.importers(files):
+        return "name the folder in which train.py lies; `dsmoe run` runs a script of any other folder"
+    if facts.those(found, "uses ") or "from " + facts.OF_GSPLAT in found:
+        return (f"neither a patch nor `dsmoe run` can stand in for that; an import of {INTEGRATIONS} in its code can: "
+                "integrations/README.md lists their APIs")
+    by_run = _by_run(files).replace("smoe --", "smoe --trainer NAME --")
+    return (f"no patch fits; {by_run}. NAME is the rasterizer whose API it calls (`list` prints all), or "
+            "the order of its results, such as color,depth,radii")
 
 
 def _by_run(files: Mapping[str, bytes]) -> str:

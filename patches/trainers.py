@@ -59,7 +59,9 @@ TRAINERS = (
                                rendering("render.py"))),
     # Taming 3DGS (Mallick et al. 2024) scores by renderings through the pipeline that `training` was given.
     Trainer("taming", "taming", USUAL),
-    # 3DGS (Kerbl et al. 2023) of 2024 and of before, and those that call either's rasterizer.
+    # 3DGS (Kerbl et al. 2023) of 2024 and of before, and those that call either's rasterizer. DashGaussian (Chen et al.
+    # 2025) trains by train_dash.py, which has a `training` too.
+    Trainer("dashgaussian", "inria_2024", USUAL, ("imports schedule_utils",)),
     Trainer("3dgs-2024", "inria_2024", USUAL),
     Trainer("instantsplat", "inria", USUAL, ("imports pose_utils",)),
     Trainer("gaussianpro", "inria", USUAL, ("calls depth_propagation",)),

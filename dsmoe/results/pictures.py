@@ -30,8 +30,11 @@ def file_names(camera_names: Sequence[str]) -> List[str]:
 
 
 def comparison(truth: Image.Image, renderings: Sequence[Tuple[str, Image.Image]]) -> Image.Image:
-    """One row of whole pictures, and under it the same window of each, magnified. All images have one size."""
-    window = busiest_window(truth)
+    """One row of whole pictures, and under it the same window of each, magnified. All images have one size.
+
+    The window is where the first rendering and the last one differ most.
+    """
+    window = window_of_differences(renderings[0][1], renderings[-1][1])
     columns = [("ground truth", truth), *renderings]
     factor = max(1, -(-MIN_WIDTH // truth.width))
     width, height = truth.width * factor, truth.height * factor
@@ -66,12 +69,11 @@ def loss_plot(losses: Sequence[Tuple[int, float]]) -> Image.Image:
     return picture
 
 
-def busiest_window(image: Image.Image) -> Tuple[int, int, int, int]:
-    """(left, top, right, bottom) of the window with the most edges in the ground truth, whatever the renderings."""
-    gray = np.asarray(image.convert("L"), np.float64)
-    edges = np.abs(np.diff(gray, axis=0, prepend=gray[:1])) + np.abs(np.diff(gray, axis=1, prepend=gray[:, :1]))
-    height, width = max(1, gray.shape[0] // WINDOW_SHARE), max(1, gray.shape[1] // WINDOW_SHARE)
-    sums = np.pad(edges, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+def window_of_differences(one: Image.Image, other: Image.Image) -> Tuple[int, int, int, int]:
+    """(left, top, right, bottom) of the window in which two images of one size differ most, by the absolute sum."""
+    differences = np.abs(np.asarray(one, np.float64) - np.asarray(other, np.float64)).sum(axis=2)
+    height, width = (max(1, size // WINDOW_SHARE) for size in differences.shape)
+    sums = np.pad(differences, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
     inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
     top, left = np.unravel_index(int(inside.argmax()), inside.shape)
     return int(left), int(top), int(left) + width, int(top) + height

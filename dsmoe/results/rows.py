@@ -124,10 +124,11 @@ def results_table(rows: List[Dict[str, Any]]) -> str:
 
 
 def blend_name(blend_mode: str, background_gate: Union[float, str, None]) -> str:
-    """The blend in words: the mode, in GATED_MODES with its background gate."""
+    """The blend in words: the mode, in GATED_MODES with its background gate, such as "smoe (gate 0.022)"."""
     if blend_mode not in GATED_MODES or background_gate is None:
         return blend_mode
-    return f"{blend_mode} {background_gate if isinstance(background_gate, str) else format(background_gate, '.3g')}"
+    gate = background_gate if isinstance(background_gate, str) else format(background_gate, ".2g")
+    return f"{blend_mode} (gate {gate})"
 
 
 def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:

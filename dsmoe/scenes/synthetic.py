@@ -16,6 +16,7 @@ from PIL import Image
 
 from diff_smoe_rasterization import io
 
+from ..system.progress import progress_bar
 from .cameras import Camera, rotation_to_quaternion
 from .orbit import look_at
 
@@ -224,7 +225,7 @@ def render_view(objects: Sequence, camera: Camera, supersampling: int) -> Tuple[
 
 
 def write_synthetic_scene(folder: str, views: int = 48, width: int = 200, height: int = 150, points: int = 8000,
-                          supersampling: int = 2, seed: int = 0) -> None:
+                          supersampling: int = 2, seed: int = 0, progress: bool = False) -> None:
     """Writes the room as a COLMAP text model with images; the starting points are samples that the views see.
 
     views: every 8th becomes a test view when the folder is loaded. points: about so many, evenly over the views.
@@ -240,7 +241,8 @@ def write_synthetic_scene(folder: str, views: int = 48, width: int = 200, height
         return hits[chosen], colors[chosen]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        samples = list(pool.map(write_view, range(views)))
+        samples = list(progress_bar(pool.map(write_view, range(views)), total=views, desc="views", unit="view",
+                                    leave=False, disable=not progress))
     positions, colors = (np.concatenate(arrays) for arrays in zip(*samples))
     io.write_colmap(os.path.join(folder, "sparse", "0"), _colmap_model(cameras, positions, colors), text=True)
 

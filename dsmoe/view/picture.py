@@ -11,6 +11,7 @@ from diff_smoe_rasterization.settings import GATED_MODES, resolve_background_gat
 
 from ..inspection import to_image
 from ..results.rendering import Renderer
+from ..results.rows import blend_name
 from ..scenes.cameras import Camera
 
 SHOWN = ("colour", "gates", "largest gate", "depth", "coverage")
@@ -31,7 +32,7 @@ class Blend:
         return cls(renderer.blend_mode, gate)
 
     def __str__(self) -> str:
-        return f"{self.mode} {self.background_gate:.3g}" if self.mode in GATED_MODES else self.mode
+        return blend_name(self.mode, self.background_gate)
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import extension
@@ -202,17 +204,18 @@ find_package(diff_smoe_rasterization REQUIRED COMPONENTS gpu)
 
 
 def documented_programs():
-    """The programs of docs/cpp.md, by the target that the comment in their first line names."""
-    blocks = re.findall(r"```cpp\n(// dsmoe::(\w+)[^\n]*\n.*?)```", (ROOT / "docs" / "cpp.md").read_text(), re.DOTALL)
-    return {name: text for text, name in blocks}
+    """The programs of docs/cpp.md, by the targets that the comment in their first line names, such as "core and io"."""
+    blocks = re.findall(r"```cpp\n(// dsmoe::(\w+(?: and dsmoe::\w+)*)[^\n]*\n.*?)```",
+                        (ROOT / "docs" / "cpp.md").read_text(), re.DOTALL)
+    return {name.replace("dsmoe::", ""): text for text, name in blocks}
 
 
 def test_every_target_is_documented_by_a_program():
-    assert sorted(documented_programs()) == ["core", "cuda", "io", "torch"]
+    assert sorted(documented_programs()) == ["core", "core and io", "cuda", "io", "torch"]
 
 
 @needs_cmake
-@pytest.mark.parametrize("name", ["core", "io", pytest.param("cuda", marks=pytest.mark.slow),
+@pytest.mark.parametrize("name", ["core", "core and io", "io", pytest.param("cuda", marks=pytest.mark.slow),
                                   pytest.param("torch", marks=pytest.mark.slow)])
 def test_documented_programs_are_built_and_run(tmp_path, name):
     if name == "cuda" and "cuda" not in extension.BACKENDS:
@@ -222,13 +225,45 @@ def test_documented_programs_are_built_and_run(tmp_path, name):
     (tmp_path / "program.cpp").write_text(documented_programs()[name])
     (tmp_path / "CMakeLists.txt").write_text(f"""cmake_minimum_required(VERSION 3.21)
 project(program LANGUAGES CXX)
-find_package(diff_smoe_rasterization 0.1 REQUIRED COMPONENTS {name})
+find_package(diff_smoe_rasterization 0.1 REQUIRED COMPONENTS {" ".join(name.split(" and "))})
 add_executable(program program.cpp)
-target_link_libraries(program PRIVATE dsmoe::{name})
+target_link_libraries(program PRIVATE {" ".join("dsmoe::" + one for one in name.split(" and "))})
 """)
     build(tmp_path, tmp_path / "build")
-    if name != "cuda":  # its program needs a GPU
+    if name == "core and io":
+        shows_a_model(tmp_path / "build" / "program", tmp_path)
+    elif name != "cuda":  # its program needs a GPU
         run(tmp_path / "build" / "program", cwd=str(tmp_path))
+
+
+def shows_a_model(program, folder):
+    """Whether the program renders a .ply as Python does, and says in a line what is wrong with another file."""
+    random = np.random.RandomState(0)
+    count, degree = 200, 2
+    model = diff_smoe_rasterization.io.Gaussians(
+        means3D=random.randn(count, 3), dc=random.rand(count, 1, 3), shs=random.randn(count, 8, 3) * 0.2,
+        opacity_logits=random.randn(count, 1), log_scales=random.randn(count, 3) * 0.3 - 2,
+        rotations=random.randn(count, 4), blend_mode="smoe", background_gate=0.05)
+    diff_smoe_rasterization.io.write_gaussians(str(folder / "model.ply"), model)
+    run(program, folder / "model.ply", folder / "image.ppm")
+    settings = diff_smoe_rasterization.settings_from_camera(
+        [[400, 0, 200], [0, 400, 150], [0, 0, 1]], torch.eye(3), torch.tensor([0.0, 0.0, 4.0]), 400, 300,
+        blend_mode="smoe", background_gate=0.05, sh_degree=degree)
+    tensors = {name: torch.tensor(getattr(model, name), dtype=torch.float32)
+               for name in ("means3D", "dc", "shs", "opacity_logits", "log_scales", "rotations")}
+    expected = diff_smoe_rasterization.rasterize(
+        settings=settings, means3D=tensors["means3D"], shs=torch.cat([tensors["dc"], tensors["shs"]], dim=1),
+        opacities=tensors["opacity_logits"].sigmoid(), scales=tensors["log_scales"].exp(),
+        rotations=torch.nn.functional.normalize(tensors["rotations"])).color
+    with Image.open(folder / "image.ppm") as image:
+        shown = np.asarray(image).astype(int)
+    assert expected.mean() > 0.1
+    # One step, where exp or sigmoid of torch is another float.
+    assert np.abs(shown - (expected.clamp(0, 1) * 255).round().permute(1, 2, 0).numpy()).max() <= 1
+    (folder / "other.ply").write_text("ply\n")
+    result = subprocess.run([str(program), str(folder / "other.ply"), str(folder / "other.ppm")],
+                            stderr=subprocess.PIPE, universal_newlines=True)
+    assert result.returncode == 1 and "other.ply" in result.stderr and result.stderr.count("\n") == 1
 
 
 @needs_cmake

@@ -103,7 +103,8 @@ def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
     refused(make(tmp_path / "missing", {"train.py": None}), "train.py: rule pipe-blend-mode: there is no such file")
     refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: rule pipe-blend-mode: is not Python",
             "(line 11)")
-    refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", "nothing imports Gaussian")
+    refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", "nothing imports Gaussian",
+            "name the folder in which train.py lies")
     refused(make(tmp_path / "checkout"), "no trainer 'x'", *patches.TRAINERS, trainer="x")
     refused(tmp_path / "checkout", "hac", trainer="hac")
     refused(tmp_path / "checkout/arguments", f"there is no {GR} in it")

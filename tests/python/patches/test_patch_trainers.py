@@ -75,7 +75,7 @@ def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, res
             "inv_depth": f"its rasterizer is color,radii,inverse_depth, {run}",
             "blur": "its GaussianRasterizationSettings have blur, which no rasterizer has that is known here"}
     refused(tmp_path, "unknown", next((said[name] for name in said if name in renderer),
-                                      f"its rasterizer returns {count} "))
+                                      f"its rasterizer returns {count} "), "type `dsmoe run --blend-mode smoe ")
 
 
 VISIBLE = """
@@ -164,6 +164,18 @@ def test_a_patched_trainer_finds_sparse_adam_where_it_asks_or_was_written_for_it
     assert contents(tmp_path) == before
 
 
+def test_dashgaussian_trains_by_a_script_of_its_own(tmp_path):
+    """Which has the rest of 3DGS of 2024, and imports its scheduler."""
+    dash = "from utils.schedule_utils import TrainingScheduler\n" + TRAIN
+    make(tmp_path, {GR: ANTIALIASED, "train_dash.py": dash, "utils/schedule_utils.py": ""})
+    before = contents(tmp_path)
+    assert patches.apply(tmp_path).trainer == "dashgaussian"
+    for script in ("train.py", "train_dash.py"):
+        assert "pipe.blend = blend_of(dataset)" in (tmp_path / script).read_text()
+    patches.revert(tmp_path)
+    assert contents(tmp_path) == before
+
+
 def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
     make(tmp_path, {GR: ANTIALIASED})
     (note,) = patches.apply(tmp_path, trainer="3dgs-2023").notes
@@ -174,14 +186,16 @@ def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
 def test_a_fork_that_no_contract_fits_is_patched_with_a_warning_and_one_of_another_rasterizer_is_not(tmp_path):
     call = BY_NAME.format("color, radii").replace("get_xyz)", "get_xyz, degrees=pc.degrees)")  # reduced-3dgs
     make(tmp_path / "fork", {GR: RENDERER.replace(ONE_LINE, call)})
-    refused(tmp_path / "fork", "unknown", "its rasterizer is called with degrees, which no rasterizer has")
+    refused(tmp_path / "fork", "unknown", "its rasterizer is called with degrees, which no rasterizer has",
+            "`dsmoe run --blend-mode smoe --trainer NAME -- python train.py ...`")
     (note,) = patches.apply(tmp_path / "fork", trainer="3dgs-2023").notes
     assert "--trainer 3dgs-2023: its rasterizer is called with degrees" in note
     private = RENDERER.replace("import math", "from diff_gaussian_rasterization._C import kmeans_cuda\nimport math")
     refused(make(tmp_path / "private", {GR: private}), "it imports diff_gaussian_rasterization._C.kmeans_cuda, which")
     both = RENDERER + "\n\ndef render_imp():\n    from diff_gaussian_rasterization_gof import GaussianRasterizer\n"
     beside = {"gaussian_renderer/b.py": both, "train.py": "from gaussian_renderer import b\n" + TRAIN}
-    refused(make(tmp_path / "beside", beside), "it imports diff_gaussian_rasterization_gof, another rasterizer")
+    refused(make(tmp_path / "beside", beside), "it imports diff_gaussian_rasterization_gof, another rasterizer",
+            "an import of diff_smoe_rasterization.integrations in its code can")
     for trainer in (None, "3dgs-2023"):  # one beside Inria's, as in gaussian-opacity-fields
         refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_gof, another rasterizer",
                 trainer=trainer)

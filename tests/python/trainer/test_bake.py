@@ -61,7 +61,7 @@ def test_a_baked_model_is_better_in_alpha_than_what_viewers_show(smoe_run, tmp_p
     assert main(["export", smoe_run.output, "-o", path, "--bake", "alpha", "--bake-iterations", "150"]) == 0
     said = capsys.readouterr().out
     trained, shown, baked, change = map(float, re.search(
-        r"test PSNR: ([\d.]+) dB in smoe 0.01, ([\d.]+) dB when viewers blend that by alpha, "
+        r"test PSNR: ([\d.]+) dB in smoe .gate 0.01., ([\d.]+) dB when viewers blend that by alpha, "
         r"([\d.]+) dB baked to alpha \(([-+][\d.]+) dB\)", said).groups())
     assert "viewers of 3DGS" not in said, "what was written is alpha"
     before, after = io.read_gaussians(model_path(smoe_run.output, 250)), io.read_gaussians(path)
@@ -165,6 +165,6 @@ def test_what_cannot_be_baked_is_refused(smoe_run, tmp_path, capsys):
     assert "name the scene's folder with --scene" in refused("smoe", 0.01)
     scene = ["--scene", smoe_run.scene]
     assert "blended by alpha already; leave out --bake" in refused("alpha", None, *scene)
-    assert "blended by alpha already; leave out --bake" in refused("smoe", 1.0, *scene)
+    assert "blended by alpha already; leave out --bake" in refused("smoe_eq7", 1.0, *scene)
     assert "--bake-iterations is 0; it must be at least 1" in refused("smoe", 0.01, *scene, "--bake-iterations", "0")
     assert not (tmp_path / "new.ply").exists()

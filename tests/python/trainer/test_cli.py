@@ -22,6 +22,7 @@ from dsmoe import inspection
 from dsmoe.cli import main
 from dsmoe.config import TrainConfig
 from dsmoe.config_arguments import GROUPS
+from dsmoe.fast import with_preset
 from dsmoe.results.modelfile import load_model
 from dsmoe.results.rows import viewer_warning
 from dsmoe.scenes.scene import load_scene
@@ -807,6 +808,37 @@ def test_a_budget_without_time_to_settle_is_told(scene, tmp_path, capsys, until,
     assert main(["train", scene, "-o", str(tmp_path / "out"), "--iterations", "30", "--scale-recipe", "--budget", "40",
                  "--densify-until-iter", str(until), "--quiet"]) == 0
     assert ("no iterations to settle" in capsys.readouterr().out) is not has_time
+
+
+@pytest.mark.parametrize("words, budget, iterations, until, settings", [
+    (["--iterations", "30"], 90, 30, 10, "overshoot=1.5,removals=4"),
+    (["--iterations", "30", "--budget", "70"], 70, 30, 10, "overshoot=1.5,removals=4"),
+    (["--iterations", "30", "--init-points", "20"], 60, 30, 10, "overshoot=1.5,removals=4"),
+    (["--iterations", "30", "--strategy-options", "views=3,removals=2", "--densify-until-iter", "12"], 90, 30, 12,
+     "views=3,removals=2,overshoot=1.5")])
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_fast(scene, tmp_path, monkeypatch, mode, words, budget, iterations, until, settings):
+    """The tiny scene has 144 points: three for each would be 432, more than the bound that is set here."""
+    monkeypatch.setattr("dsmoe.fast.LEAST", 10)
+    monkeypatch.setattr("dsmoe.fast.MOST", 90)
+    output = str(tmp_path / "out")
+    assert main(["train", scene, "-o", output, "--fast", "--blend-mode", mode, *words, "--quiet"]) == 0
+    config, (row,) = TrainConfig.load(output), results_of(output)
+    assert (config.budget, config.iterations, config.densify_until_iter) == (budget, iterations, until)
+    assert config.strategy_options == settings and row["num_gaussians"] == budget
+    assert config.position_lr_max_steps == 30 and config.sh_degree_interval == 1
+    assert main(["train", scene, "--resume", "-o", output, "--fast", "--blend-mode", mode, *words, "--quiet"]) == 0
+
+
+def test_fast_is_of_importance_and_has_defaults(scene, tmp_path, capsys):
+    text = fails(capsys, "train", scene, "-o", str(tmp_path / "out"), "--fast", "--strategy", "mcmc")
+    assert "--strategy is 'mcmc'; it must be left out or importance with --fast" in text
+    options = with_preset({"seed": 3})
+    assert options == {"seed": 3, "iterations": 7000, "densify_until_iter": 2450, "strategy": "importance",
+                       "strategy_options": "overshoot=1.5,removals=4"}
+    with pytest.raises(SystemExit):
+        main(["train", "--resume", str(tmp_path / "out"), "--fast"])
+    assert "--fast needs SCENE" in capsys.readouterr().err
 
 
 def test_info(capsys):

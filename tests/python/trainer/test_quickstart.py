@@ -14,7 +14,7 @@ from PIL import Image
 
 from diff_smoe_rasterization.io import read_gaussians
 from dsmoe import cli, quickstart, short_run
-from dsmoe.results.pictures import busiest_window, comparison, evenly_spaced
+from dsmoe.results.pictures import MARGIN, comparison, evenly_spaced, window_of_differences
 from dsmoe.system import files
 
 
@@ -54,7 +54,7 @@ def test_pictures_show_truth_and_both_modes(output):
 def test_the_table_and_a_second_run(tiny_scene, output, capsys):
     assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "20", "--quiet"]) == 0
     text = capsys.readouterr().out
-    for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", "\nsmoe 0.",
+    for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", "\nsmoe (gate 0.",
                  "compare_view_000.png", "note: the smoe .ply holds gates; viewers"):
         assert word in text
 
@@ -167,25 +167,26 @@ def test_an_output_that_is_a_file_is_one_line(tiny_scene, tmp_path, capsys):
 def test_without_a_scene_one_is_made(tmp_path, monkeypatch, capsys):
     make = quickstart.write_synthetic_scene
     monkeypatch.setattr(quickstart, "write_synthetic_scene",
-                        lambda folder: make(folder, views=9, width=32, height=24, points=150, supersampling=1))
+                        lambda folder, progress: make(folder, views=9, width=32, height=24, points=150,
+                                                       supersampling=1))
     assert quickstart.main(["-o", str(tmp_path), "--iterations", "12", "--quiet"]) == 0
     assert "making a scene" in capsys.readouterr().out
     assert (tmp_path / "scene" / "images" / "view_003.png").is_file() and (tmp_path / "smoe.ply").is_file()
 
 
-def test_the_busiest_window_is_where_the_edges_are():
-    pixels = np.full((40, 80, 3), 128, np.uint8)
-    pixels[22:30, 50:66:2] = 255  # stripes
-    left, top, right, bottom = busiest_window(Image.fromarray(pixels))
+def test_comparison_magnifies_under_whole_pictures_where_the_renderings_differ():
+    """Not where the ground truth has its edges."""
+    truth = np.random.RandomState(0).randint(0, 255, (40, 80, 3)).astype(np.uint8)
+    other = truth.copy()
+    other[22:30, 50:66] //= 2
+    left, top, right, bottom = window_of_differences(*map(Image.fromarray, (truth, other)))
     assert (right - left, bottom - top) == (20, 10)
     assert left <= 50 and right >= 66 and top <= 22 and bottom >= 30
-
-
-def test_comparison_lays_out_whole_pictures_above_windows():
-    truth = Image.fromarray(np.random.RandomState(0).randint(0, 255, (30, 40, 3)).astype(np.uint8))
-    sheet = comparison(truth, [("alpha", Image.new("RGB", (40, 30), (10, 20, 30)))])
-    pixels = np.asarray(sheet)
-    assert (pixels[-20, -100] == [10, 20, 30]).all(), "the second column's window shows the second image"
+    sheet = np.asarray(comparison(Image.fromarray(truth), [("alpha", Image.fromarray(truth)),
+                                                           ("smoe", Image.fromarray(other))]))
+    factor = 4 * 400 // 80  # a quarter is magnified to the size of the whole, whose width becomes 400
+    window = sheet[-200 - MARGIN:-MARGIN:factor, -400 - MARGIN:-MARGIN:factor]
+    np.testing.assert_array_equal(window, other[top:bottom, left:right])
 
 
 @pytest.mark.parametrize("count, wanted, expected", [(0, 3, []), (1, 3, [0]), (2, 3, [0, 1]), (6, 3, [0, 2, 5]),

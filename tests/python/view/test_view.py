@@ -52,7 +52,7 @@ def camera_of(opened):
 def test_a_picture_is_the_rendering(opened):
     with torch.no_grad():
         expected = np.asarray(to_image(opened.renderer(camera_of(opened)).color))
-    assert str(Blend.of(opened.renderer)) == "smoe_eq7 0.03"
+    assert str(Blend.of(opened.renderer)) == "smoe_eq7 (gate 0.03)"
     assert np.array_equal(picture(opened.renderer, camera_of(opened), Look(Blend.of(opened.renderer))), expected)
 
 
