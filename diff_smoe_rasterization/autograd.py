@@ -12,8 +12,7 @@ import functools
 import torch
 from torch.autograd import forward_ad
 
-from .core import _core
-from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
+from .extension import _core  # loading it registers the ops
 from .settings import FEATURE_OUTPUTS
 
 _OPS = torch.ops.diff_smoe_rasterization

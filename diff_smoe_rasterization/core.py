@@ -3,22 +3,9 @@ from __future__ import annotations
 
 import importlib
 import os
-from typing import Any, NoReturn, Optional
+from typing import Any
 
-BUILD = "in the source folder type: pip install --no-build-isolation -e ."
-
-
-def recorded(name: str) -> Optional[str]:
-    """Returns what the build wrote down under this name, readable even where the extension cannot be loaded."""
-    try:
-        return getattr(importlib.import_module("._build_info", __package__), name, None)
-    except ImportError:
-        return None
-
-
-def fail(reason: str, cause: Optional[BaseException] = None) -> NoReturn:
-    """Raises the ImportError that says why this package does not work."""
-    raise ImportError(f"diff_smoe_rasterization: {reason}") from cause
+from .build_record import BUILD, fail
 
 
 def _load() -> Any:

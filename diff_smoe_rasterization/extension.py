@@ -7,7 +7,7 @@ from typing import Any, Dict, Tuple
 import torch
 
 from ._version import __version__
-from .core import BUILD, _core, fail, recorded
+from .build_record import BUILD, fail, recorded
 
 _BUILD_AGAIN = "build it again against this torch: pip install --no-build-isolation --no-deps --force-reinstall ."
 
@@ -20,7 +20,7 @@ def _numbers(version: str) -> Tuple[int, ...]:
     return tuple(int(number) for number in version.split(".")[:2])
 
 
-def _load_ops() -> None:
+def _check_torch() -> None:
     built_against = recorded("TORCH_VERSION")
     stable_since = recorded("STABLE_ABI_SINCE")
     if stable_since is not None and _numbers(torch.__version__) < _numbers(stable_since):
@@ -29,13 +29,17 @@ def _load_ops() -> None:
     mismatch = f"its ops were built against torch {built_against}, but torch {torch.__version__} is running; "
     if stable_since is None and built_against is not None and _release(built_against) != _release(torch.__version__):
         fail(mismatch + _BUILD_AGAIN)
+
+
+def _load_ops() -> None:
     path = os.path.join(os.path.dirname(os.path.abspath(__file__)), "_ops.so")
     if not os.path.isfile(path):
         fail(f"its ops are not built: there is no {path}; {BUILD}")
     try:
         torch.ops.load_library(path)
     except OSError as error:
-        fail((f"its ops do not load ({error}); they were built against torch {built_against or 'of another build'}, "
+        fail((f"its ops do not load ({error}); they were built against torch "
+              f"{recorded('TORCH_VERSION') or 'of another build'}, "
               f"and torch {torch.__version__} is running; ") + _BUILD_AGAIN, error)
 
 
@@ -45,6 +49,9 @@ def _built_with_cuda() -> bool:
     except ValueError as error:  # DSMOE_SIMD names no level of this processor
         fail(str(error))
 
+
+_check_torch()
+from .core import _core  # noqa: E402  (which would not say that PyTorch is another)
 
 _load_ops()
 
