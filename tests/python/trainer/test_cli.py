@@ -509,7 +509,7 @@ def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path
     assert 0.05 < gate < 0.2 and gate != 0.1
     text = capsys.readouterr().out
     assert "viewers of 3DGS blend them by alpha" in text
-    assert "smoe learned" in text and f"\nsmoe {gate:.3g} " in text
+    assert "smoe (gate learned)" in text and f"\nsmoe (gate {gate:.2g}) " in text
     assert io.read_gaussians(ply_of(output)).background_gate == gate
     assert main(["eval", output]) == 0
     after, = results_of(output)
@@ -738,7 +738,7 @@ def test_an_interrupted_training_is_looked_at_by_its_checkpoint(scene, tmp_path,
         said = capsys.readouterr()
         assert said.err == note, command
         if command == "eval":
-            psnr = float(re.search(r"\n\w+(?: [\d.]+)? +([\d.]+) ", said.out.split("---")[-1]).group(1))
+            psnr = float(re.search(r"\n\w+(?: \(gate [\d.]+\))? +([\d.]+) ", said.out.split("---")[-1]).group(1))
     assert before == ({path for path, _, _ in os.walk(run)}, sorted(os.listdir(run))), "no results of half a training"
     model, recorded = load_model(str(tmp_path / "model.ply"), "cpu")
     assert recorded.blend_mode == mode and torch.equal(model.raw["means3D"], state["raw"]["means3D"])
