@@ -29,7 +29,7 @@ from .names import ROW_NAME, read_json
 
 LOG_NAME = "log.txt"
 SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device
-SHARING_NAME = "cells_at_once.json"  # beside a checkpoint: its seconds were counted while so many shared the device
+SHARING_NAME = "cells_at_once.json"  # the seconds of the run's checkpoint were counted while so many shared the device
 AXES = ("blend_mode", "background_gate", "strategy", "densify_grad_threshold", "seed", "headline")
 FIGURES = ("psnr", "psnr_float", "ssim", "psnr_edge", "num_gaussians", "train_seconds", "fps", "peak_gpu_mib")
 
@@ -77,8 +77,8 @@ def measured_row(cell: Dict[str, Any], output: str, started: float, per_device: 
 
 
 def note_sharing(output: str, per_device: Optional[int]) -> Optional[int]:
-    """Writes beside the checkpoint how many cells may have the device; returns the most of earlier attempts."""
-    path = Path(output, "run", SHARING_NAME)
+    """Writes into the cell's folder how many cells may have the device; returns the most of earlier attempts."""
+    path = Path(output, SHARING_NAME)
     earlier = read_json(path) if path.is_file() else None
     if (per_device or 0) > (earlier or 0):
         write_json_atomically(str(path), per_device)
