@@ -16,7 +16,7 @@ import torch
 
 from .config import IMAGES, TrainConfig, flags_text
 from .config_arguments import add_arguments
-from .errors import TrainerError, in_one_line
+from .errors import TrainerError, in_one_line, print_any_name
 from .inspection import open_renderer, to_image
 from .results.metrics import psnr, quantised
 from .results.modelfile import model_path
@@ -48,6 +48,7 @@ FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bo
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the comparison; returns the exit status."""
+    print_any_name()
     arguments = _parse(argv)
     try:
         run(arguments)
