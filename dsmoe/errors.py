@@ -36,6 +36,11 @@ class ConfigError(TrainerError):
     """An option, or a file of options, has a value that it must not have."""
 
 
+def said_of(error: BaseException) -> str:
+    """What an error of reading a file says, without the number that an OSError's text begins with."""
+    return in_one_line(error) or str(error)
+
+
 def in_one_line(error: BaseException) -> Optional[str]:
     """What a command prints of an error in place of a traceback; None where the error is no user's."""
     if isinstance(error, OSError) and error.strerror:  # whose text begins with a number

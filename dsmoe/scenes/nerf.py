@@ -15,7 +15,7 @@ import numpy as np
 from diff_smoe_rasterization import io
 
 from ..config import TrainConfig
-from ..errors import SceneError
+from ..errors import SceneError, said_of
 from ..model import SH_C0
 from ..system.files import is_file
 from .cameras import LARGEST, Camera
@@ -108,7 +108,7 @@ def _read_points(path: str) -> PointCloud:
     try:
         points = io.read_points(path)
     except (OSError, ValueError) as error:
-        raise SceneError(str(error)) from error
+        raise SceneError(said_of(error)) from error
     colors = points.colors if points.colors is not None else np.full(points.positions.shape, 128, np.uint8)
     return PointCloud(np.asarray(points.positions, np.float64), colors / 255.0).checked(path)
 

@@ -573,9 +573,18 @@ def test_a_truncated_binary_file(colmap_folder, name):
     refused(colmap_folder, name + ".bin")
 
 
-def test_a_missing_model_file(colmap_folder):
-    os.remove(os.path.join(colmap_folder, "sparse", "0", "images.txt"))
-    refused(colmap_folder, "images.txt")
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_missing_model_file(colmap_folder, name, text):
+    model = io.read_colmap(colmap_folder)
+    shutil.rmtree(model.folder)
+    io.write_colmap(model.folder, model, text=text)
+    path = os.path.join(model.folder, name + (".txt" if text else ".bin"))
+    os.remove(path)
+    with pytest.raises(SceneError) as error:
+        load(colmap_folder)
+    words = "no COLMAP model here: neither cameras.bin" if name == "cameras" else f"{path}: no such file"
+    assert words in str(error.value) and "Errno" not in str(error.value)
 
 
 def test_an_empty_model(colmap_folder):
@@ -638,6 +647,22 @@ def test_both_files_of_a_nerf_scene_may_list_an_image_and_the_split_says_so(nerf
     shutil.copy(nerf_folder / "transforms_train.json", nerf_folder / "transforms_test.json")
     scene = load(nerf_folder)
     assert scene.split == "transforms_test.json lists the test images, 1 of which are training images too"
+
+
+@pytest.mark.parametrize("small", [1e-300, 5e-324, 1e-10, 0.0, -1.0])
+def test_focal_lengths_that_show_nothing(any_scene, small):
+    """What a COLMAP reader lets through too: below a billionth of a pixel."""
+    folder, _ = any_scene
+    if os.path.isdir(os.path.join(folder, "sparse")):
+        model = io.read_colmap(folder)
+        for text in (True, False):
+            model.cameras[1].params[:2] = (small, 30) if text else (30, small)
+            io.write_colmap(model.folder, model, text=text)
+            refused(folder, "focal length")
+        return
+    for name in {*os.listdir(folder)} & {"transforms.json", "transforms_train.json"}:
+        edit_json(pathlib.Path(folder, name), lambda content: content.update(fl_x=small))
+    refused(folder, "`fl_x`", "must be positive, 1e-09 at least")
 
 
 @pytest.mark.parametrize("large", [1e300, -2e9])
