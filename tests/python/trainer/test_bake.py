@@ -165,6 +165,6 @@ def test_what_cannot_be_baked_is_refused(smoe_run, tmp_path, capsys):
     assert "name the scene's folder with --scene" in refused("smoe", 0.01)
     scene = ["--scene", smoe_run.scene]
     assert "blended by alpha already; leave out --bake" in refused("alpha", None, *scene)
-    assert "blended by alpha already; leave out --bake" in refused("smoe", 1.0, *scene)
+    assert "blended by alpha already; leave out --bake" in refused("smoe_eq7", 1.0, *scene)
     assert "--bake-iterations is 0; it must be at least 1" in refused("smoe", 0.01, *scene, "--bake-iterations", "0")
     assert not (tmp_path / "new.ply").exists()
