@@ -340,7 +340,8 @@ def test_transforms_with_points_masks_and_listed_images(transforms_folder):
     np.testing.assert_array_equal(scene.points.positions, positions)
     assert [view.camera.name[-5] for view in scene.train] == list("012345")
     assert [view.camera.name[-5] for view in scene.test] == list("78")
-    assert scene.split == "transforms.json lists the test images" and scene.train[0].mask.shape == (1, 10, 20)
+    assert scene.split == "transforms.json lists the test images, 2 images are in neither list"
+    assert scene.train[0].mask.shape == (1, 10, 20)
     for names, train, test in ((["train"], "012345", "6789"), (["test"], "0123456" + "9", "78"),
                                (["val"], "012345" + "789", "6")):
         left = json.loads((transforms_folder / "transforms.json").read_text())
@@ -355,6 +356,12 @@ def test_transforms_with_points_masks_and_listed_images(transforms_folder):
         assert ["".join(view.camera.name[-5] for view in views) for views in (scene.train, scene.test)] == [train, test]
     edit_json(transforms_folder / "transforms.json", lambda content: content.update(test_filenames=["images/no.jpg"]))
     refused(transforms_folder, "transforms.json", "`test_filenames` names images/no.jpg, which is no frame")
+
+
+@pytest.mark.parametrize("value", [-1, True, ["sparse_pc.ply"], float("nan"), {}])
+def test_points_of_no_name_are_not_made_up(transforms_folder, value):
+    edit_json(transforms_folder / "transforms.json", lambda content: content.update(ply_file_path=value))
+    refused(transforms_folder, "`ply_file_path` is ", "must be the name of a file")
 
 
 def write_masks(folder, size=(32, 24), name="{}.png", value=255):
@@ -708,6 +715,8 @@ def frame(**values):
     (frame(file_path="./train/r_9"), ["r_9.png", "no such image"]),
     (frame(transform_matrix=[[1, 2], [3, 4]]), ["frame 0", "transform_matrix"]),
     (frame(transform_matrix=[[1, 0, 0, 0]] * 3 + [[0, 0, 0, "x"]]), ["frame 0", "transform_matrix"]),
+    (frame(transform_matrix=np.eye(4)[[3, 0, 1, 2]].tolist()), ["frame 0", "last row", "must be 0, 0, 0, 1"]),
+    (frame(camera_model=""), ["frame 0", "`camera_model` is ''", "OPENCV"]),
     (frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), ["frame 0", "rotation"]),
     (frame(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), ["frame 0", "mirrors", "rotation"]),
     (frame(transform_matrix=[[10**400] * 4] * 4), ["frame 0", "transform_matrix"]),
