@@ -136,7 +136,7 @@ def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
 def difference_of(scene: Scene, recorded: Mapping[str, Any]) -> str:
     """The first difference from a recorded `scene_fingerprint`, as "NAME X there and Y"; "" where there is none."""
     for name, here in scene_fingerprint(scene).items():
-        there = recorded.get(name, here)  # earlier versions recorded fewer of them
+        there = recorded.get(name)
         if here != there:
             return f"{name} {there} there and {here}"
     return ""
