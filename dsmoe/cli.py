@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Dict, List, Optional
 from .arguments import build_parser, completion_script
 from .config import CHECKPOINT_NAME, TrainConfig, holds_run
 from .config_arguments import config_from_arguments, given_options
-from .errors import TrainerError, in_one_line, is_lost, printable
+from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .patches import PatchError
 from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 or 143 if interrupted."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads sleep, where they would spin
+    print_any_name()
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
     arguments.command_words = list(sys.argv[1:] if argv is None else argv)

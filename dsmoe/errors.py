@@ -1,14 +1,24 @@
 """The errors a user can cause; the command prints their text and no traceback."""
 from __future__ import annotations
 
+import io
 import os
 import re
+import sys
 from typing import Optional
 
 
 def printable(text: str) -> str:
     """The text on one line; what a terminal would obey or hide is written as its escape, such as \\x1b or \\n."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def print_any_name() -> None:
+    """Lets this process print what its streams cannot encode, such as file names that are no UTF-8."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            is_utf = stream.encoding.lower().startswith("utf")
+            stream.reconfigure(errors="surrogateescape" if is_utf else "backslashreplace")
 
 
 class TrainerError(ValueError):
@@ -24,6 +34,11 @@ class SceneError(TrainerError):
 
 class ConfigError(TrainerError):
     """An option, or a file of options, has a value that it must not have."""
+
+
+def said_of(error: BaseException) -> str:
+    """What an error of reading a file says, without the number that an OSError's text begins with."""
+    return in_one_line(error) or str(error)
 
 
 def in_one_line(error: BaseException) -> Optional[str]:

@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
 import shutil
 import sqlite3
@@ -14,13 +16,15 @@ from typing import Any, Callable, List, Optional, Sequence, Tuple
 from .choices import CAMERA_MODEL, MATCHING, MOST_EXHAUSTIVE
 from .errors import SceneError, TrainerError
 from .scenes.images import UNREADABLE, image_size, open_image
-from .system.files import is_folder
+from .system.files import is_file, is_folder, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.process import pip_install
 from .system.progress import progress_bar
 
 SCENE = "dsmoe scene"  # in its folder's record
 WORK = "colmap"  # folder in the scene's: the database, which a second run goes on with
+DATABASE = "database.db"
+FEATURES = "photographs.json"  # of which photographs the database has features
 WRITTEN = ("images", "sparse/0", *(f"{WORK}/{name}" for name in ("models", "best", "undistorted")))
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
@@ -93,9 +97,15 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
 
 def _check_folder(photos: str) -> None:
     """Raises SceneError where it is no folder."""
-    if not is_folder(photos):
-        kind = " is a file; of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
-        raise SceneError(f"{photos}{kind if os.path.isfile(photos) else ': no such folder of photographs'}")
+    if is_folder(photos):
+        return
+    if not is_file(photos):
+        raise SceneError(f"{photos}: no such folder of photographs")
+    if photos.lower().endswith(VIDEO_ENDINGS):
+        raise SceneError(f"{photos} is a file; of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 "
+                         "PHOTOS/%04d.jpg")
+    raise SceneError(f"{photos} is a file; name the folder of the photographs, such as "
+                     f"{os.path.dirname(photos) or '.'}")
 
 
 def photo_names(folder: str, output: str) -> List[str]:
@@ -105,6 +115,8 @@ def photo_names(folder: str, output: str) -> List[str]:
     """
     _check_folder(folder)
     made = os.path.join(os.path.realpath(output), "")
+    if os.path.join(os.path.realpath(folder), "").startswith(made):
+        raise SceneError(f"{folder} lies in {output}, the folder to write; name another one with -o")
     names = sorted(os.path.relpath(os.path.join(place, name), folder) for place, _, files in os.walk(folder)
                    if not os.path.join(os.path.realpath(place), "").startswith(made)
                    for name in files if not name.startswith("."))
@@ -120,7 +132,9 @@ def photo_names(folder: str, output: str) -> List[str]:
 def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: str, camera_model: str,
             progress: bool, say: Callable[[str], None]) -> Any:
     """The largest model that COLMAP makes of the photographs, which it also writes to WORK/best. Raises SceneError."""
-    database, count = os.path.join(work, "database.db"), len(names)
+    database, count = os.path.join(work, DATABASE), len(names)
+    if _forget_others(photos, names, work, camera_model):
+        say("photographs or camera model have changed since the last time: all features are found anew")
     one_camera = _are_of_one_camera(photos, names)
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
@@ -163,6 +177,36 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
     os.makedirs(os.path.join(work, "best"))
     best.write(os.path.join(work, "best"))
     return best
+
+
+def _forget_others(photos: str, names: Sequence[str], work: str, camera_model: str) -> bool:
+    """Removes the database where it is of other photographs, or of another camera model; returns whether it did.
+
+    COLMAP knows photographs by their names, and takes those that it knows for unchanged. Further ones are welcome.
+    """
+    path = os.path.join(work, FEATURES)
+    now = {"camera model": camera_model, "photographs": {name: _checksum(os.path.join(photos, name)) for name in names}}
+    before: Any = {}
+    if is_file(path):
+        with contextlib.suppress(ValueError, RecursionError), open(path, encoding="utf-8") as file:
+            before = json.load(file)
+    known = isinstance(before, dict) and before.get("camera model") == camera_model and isinstance(
+        before.get("photographs"), dict) and before["photographs"].items() <= now["photographs"].items()
+    there = is_file(os.path.join(work, DATABASE))
+    if not known:
+        for ending in ("", "-journal", "-wal", "-shm"):
+            with contextlib.suppress(FileNotFoundError):
+                os.remove(os.path.join(work, DATABASE + ending))
+    write_json_atomically(path, now)
+    return there and not known
+
+
+def _checksum(path: str) -> str:
+    hashed = hashlib.sha256()
+    with open(path, "rb") as file:
+        for part in iter(lambda: file.read(1 << 20), b""):
+            hashed.update(part)
+    return hashed.hexdigest()
 
 
 def _are_of_one_camera(photos: str, names: Sequence[str]) -> bool:

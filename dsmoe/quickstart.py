@@ -15,9 +15,9 @@ from typing import Any, Dict, List, Optional
 import torch
 
 from .config import IMAGES, TrainConfig, flags_text
-from .config_arguments import add_arguments
-from .errors import TrainerError, in_one_line
+from .errors import TrainerError, in_one_line, print_any_name
 from .inspection import open_renderer, to_image
+from .quickstart_options import DEFAULT_FOLDER, MODES, config_of, given_options, parse
 from .results.metrics import psnr, quantised
 from .results.modelfile import model_path
 from .results.pictures import comparison, evenly_spaced, file_names
@@ -32,23 +32,18 @@ from .system.output_folder import Record, make_folder, only_one, own_record, rea
 from .system.process import command, set_up_process
 from .train import train
 
-MODES = ("alpha", "smoe")
 PICTURES = 3  # test views that are shown
-DEFAULT_FOLDER = "quickstart_output"  # has a folder for each scene
 PROGRAM = "quickstart"  # in its folder's record
 MADE_UP = "the one that it makes itself"
 MADE_UP_NAME = "room"
 # On a GPU the scene that it makes is larger too.
 MADE_UP_ON_GPU = {"views": 64, "width": 480, "height": 360, "points": 30_000}
 
-# Offered by `dsmoe train` and fixed here.
-FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "background_gate_start",
-         "background_gate_lr", "eval_every", "checkpoint_every")
-
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the comparison; returns the exit status."""
-    arguments = _parse(argv)
+    print_any_name()
+    arguments = parse(argv)
     try:
         run(arguments)
         return 0
@@ -63,26 +58,9 @@ def main(argv: Optional[List[str]] = None) -> int:
         return exit_status(stop)
 
 
-def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="quickstart", argument_default=argparse.SUPPRESS,
-        description="Trains a scene twice, with alpha blending and with SMoE gating, and compares the results. "
-                    "Options that are not given are chosen so that a processor finishes in minutes; on a GPU it "
-                    "trains at full size for about a minute.")
-    parser.add_argument("scene", nargs="?", metavar="SCENE", default=None,
-                        help="folder of a scene: COLMAP, transforms.json or NeRF-synthetic (default: one made on the "
-                             "spot)")
-    parser.add_argument("-o", "--output", metavar="OUT", default=None,
-                        help="folder to write: new, empty, or of the same scene (default: "
-                             f"{DEFAULT_FOLDER}/NAME, with the scene's name)")
-    parser.add_argument("--quiet", action="store_true", default=False, help="no progress bars")
-    add_arguments(parser, skip=FIXED, defaults=False)
-    return parser.parse_args(argv)
-
-
 def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     """Makes the scene where none is named, trains both modes, writes results and pictures; returns the rows."""
-    given = {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
+    given = given_options(arguments)
     progress = not arguments.quiet
     given["device"] = chosen_device(given.get("device"))
     print(device_line(given["device"]), flush=True)
@@ -147,10 +125,7 @@ def _earlier_files(output: str, subject: str) -> List[str]:
 
 
 def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
-    """The given options, and for the others a short training (`short_run`); prints what it chose.
-
-    The recipe's milestones keep their share of the iterations (`TrainConfig.shortened`).
-    """
+    """The given options, and for the others a short training (`short_run`); prints what it chose."""
     layout = read_layout(TrainConfig(scene=folder, images=given.get("images", IMAGES),
                                      strict=given.get("strict", False)))
     if layout.warning:
@@ -161,8 +136,7 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
     if chosen:
         lasts = "some minutes" if device == "cpu" else "about a minute"
         print(f"chosen for a run of {lasts}: {flags_text(chosen)}", flush=True)
-    base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
-    return base.changed(**{**chosen, **given}).shortened().changed(**given)
+    return config_of(folder, {**chosen, **given}, given)
 
 
 def shown_views(scene: Scene) -> Dict[str, View]:

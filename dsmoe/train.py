@@ -16,7 +16,7 @@ from .results.rendering import Rasterize
 from .results.rows import RESULTS_NAME, result_row, write_results
 from .results.scalars import FOLDER as SCALARS_FOLDER
 from .results.scalars import Scalars, scalar_files
-from .scenes.scene import Scene, describe_scene, load_scene, read_layout, scene_fingerprint
+from .scenes.scene import Scene, describe_scene, load_scene, read_layout
 from .system.device import check_device
 from .system.files import is_file, write_atomically, write_json_atomically
 from .system.group import Group
@@ -72,10 +72,6 @@ class Run:
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
             self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
-        unknown = [name for name in scene_fingerprint(self.trainer.scene) if name not in state["scene"]]
-        if unknown and self.trainer.leads:
-            print(f"note: {path} is of an earlier version and lacks the {', the '.join(unknown)}: whether these have "
-                  "changed since is not known")
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "

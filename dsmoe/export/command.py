@@ -11,7 +11,7 @@ from diff_smoe_rasterization.settings import GATED_MODES
 
 from ..choices import BAKE_ITERATIONS
 from ..choices import EXPORT_FORMATS as FORMATS
-from ..errors import TrainerError
+from ..errors import TrainerError, printable
 from ..opening import Trained, open_trained
 from ..results.modelfile import save_model
 from ..results.pictures import evenly_spaced
@@ -119,7 +119,7 @@ def _shown(trained: Trained) -> html.Shown:
     renderer = trained.renderer
     red, green, blue = renderer.background.tolist()
     cameras = [trained.cameras[index] for index in evenly_spaced(len(trained.cameras), VIEWS)]
-    title = os.path.basename(os.path.abspath(trained.config.scene or trained.path))
+    title = printable(os.path.basename(os.path.abspath(trained.config.scene or trained.path)))
     return html.Shown(title, renderer.blend_mode, float(renderer.background_gate), (red, green, blue),
                       renderer.antialiasing, cameras, trained.orbit)
 

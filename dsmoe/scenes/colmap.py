@@ -8,7 +8,7 @@ import numpy as np
 from diff_smoe_rasterization import io
 
 from ..config import TrainConfig
-from ..errors import SceneError
+from ..errors import SceneError, said_of
 from ..system.files import is_folder
 from .cameras import Camera, quaternion_to_rotation
 from .layout import Layout, PosedImage, hold_out
@@ -21,7 +21,7 @@ def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
     try:
         model = io.read_colmap(folder)
     except (OSError, ValueError) as error:
-        raise SceneError(str(error)) from error
+        raise SceneError(said_of(error)) from error
     for camera in model.cameras.values():
         _refuse_other_models(model.folder, camera)
     image_folder = os.path.join(folder, config.images)

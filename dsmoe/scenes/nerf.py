@@ -15,7 +15,7 @@ import numpy as np
 from diff_smoe_rasterization import io
 
 from ..config import TrainConfig
-from ..errors import SceneError
+from ..errors import SceneError, said_of
 from ..model import SH_C0
 from ..system.files import is_file
 from .cameras import LARGEST, Camera
@@ -60,7 +60,9 @@ def read_transforms_layout(folder: str, config: TrainConfig) -> Layout:
     images = [_posed_image(folder, path, content, index) for index in range(len(content["frames"]))]
     train, test, split = _listed_split(folder, path, content, images) or hold_out(images, config.test_every)
     points = content.get("ply_file_path")
-    if isinstance(points, str):
+    if points is not None and not isinstance(points, str):
+        raise SceneError(f"{path}: `ply_file_path` is {reprlib.repr(points)}; it must be the name of a file")
+    if points is not None:
         return Layout("transforms", train, test, _read_points(os.path.join(folder, points)), split)
     cameras = [image.camera for image in images]
     middle = orbit_of_cameras(cameras).target
@@ -94,7 +96,9 @@ def _listed_split(folder: str, path: str, content: Dict[str, Any], images: List[
              or "train" not in chosen and image.camera.name not in chosen[test_kind]]
     test = [image for image in images if image.camera.name in chosen.get(test_kind, ())
             or test_kind not in chosen and image.camera.name not in chosen["train"]]
-    return train, test, f"{TRANSFORMS} lists the {test_kind if test_kind in lists else 'training'} images"
+    unused = len(images) - len({image.camera.name for image in [*train, *test]})
+    said = f", {unused} images are in neither list" if unused else ""
+    return train, test, f"{TRANSFORMS} lists the {test_kind if test_kind in lists else 'training'} images{said}"
 
 
 def random_points(count: int, seed: int, middle: Any = (0.0, 0.0, 0.0), half_side: float = HALF_SIDE) -> PointCloud:
@@ -108,7 +112,7 @@ def _read_points(path: str) -> PointCloud:
     try:
         points = io.read_points(path)
     except (OSError, ValueError) as error:
-        raise SceneError(str(error)) from error
+        raise SceneError(said_of(error)) from error
     colors = points.colors if points.colors is not None else np.full(points.positions.shape, 128, np.uint8)
     return PointCloud(np.asarray(points.positions, np.float64), colors / 255.0).checked(path)
 
@@ -181,6 +185,8 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
             raise SceneError(f"{where}: `{key}` is {value:g}; it must be a whole number of pixels")
         return int(value)
 
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > MAX_SKEW:  # as of a transposed matrix
+        raise SceneError(f"{where}: the last row of `transform_matrix` is {matrix[3].tolist()}; it must be 0, 0, 0, 1")
     if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > MAX_SKEW:
         raise SceneError(f"{where}: the left 3x3 block of `transform_matrix` must be a rotation")
     if np.linalg.det(matrix[:3, :3]) < 0:
@@ -207,7 +213,8 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
 
 def _lens(model: Any, is_fisheye: bool, coefficients: Dict[str, float], where: str) -> Optional[Lens]:
     """The lens of a frame by its `camera_model`, which instant-ngp's `is_fisheye` stands for. Raises SceneError."""
-    model = model or ("OPENCV_FISHEYE" if is_fisheye else "OPENCV")
+    if model is None:
+        model = "OPENCV_FISHEYE" if is_fisheye else "OPENCV"
     if model == "OPENCV_FISHEYE":
         return lens_of(model, True, coefficients)
     if model not in PERSPECTIVE_MODELS:

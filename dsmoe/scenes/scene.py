@@ -137,7 +137,7 @@ def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
 def difference_of(scene: Scene, recorded: Mapping[str, Any]) -> str:
     """The first difference from a recorded `scene_fingerprint`, as "NAME X there and Y"; "" where there is none."""
     for name, here in scene_fingerprint(scene).items():
-        there = recorded.get(name, here)  # earlier versions recorded fewer of them
+        there = recorded.get(name)
         if here != there:
             return f"{name} {there} there and {here}"
     return ""
@@ -197,8 +197,8 @@ def _checked(folder: str, layout: Layout) -> Layout:
     for image in every:
         camera = image.camera
         numbers = [*camera.translation, camera.fx, camera.fy, camera.cx, camera.cy]
-        if not np.abs(numbers).max() <= LARGEST:
+        if not (np.abs(numbers).max() <= LARGEST and min(camera.fx, camera.fy) >= 1 / LARGEST):
             raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
                              f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
-                             f"{LARGEST:g}")
+                             f"{LARGEST:g}, and no focal length below {1 / LARGEST:g}")
     return layout

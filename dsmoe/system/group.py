@@ -4,6 +4,9 @@ from __future__ import annotations
 import contextlib
 import datetime
 import os
+import re
+import sys
+import threading
 import time
 from typing import List, Optional, Sequence
 
@@ -17,6 +20,9 @@ from .heartbeat import Heartbeat
 # Longer than a checkpoint of any size takes to write: the others wait meanwhile. A process that has died is noticed by
 # torchrun, one that is stopped by Heartbeat.
 TIMEOUT = datetime.timedelta(hours=2)
+PATIENCE = 20.0  # seconds that the processes may take to meet without a word
+OF_A_PROCESS = ("RANK", "WORLD_SIZE", "LOCAL_RANK")  # variables that torchrun sets for each
+MOST_PROCESSES = 10**6
 
 
 class Group:
@@ -112,14 +118,39 @@ class DistributedGroup(Group):
 
 
 def launched_by_torchrun() -> bool:
-    """Whether torchrun started this process, even if it is the only one."""
-    return {"RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR"} <= set(os.environ)
+    """Whether torchrun started this process, even if it is the only one.
+
+    Raises TrainerError where its variables are there in part, or say what cannot be.
+    """
+    there = [name for name in OF_A_PROCESS if name in os.environ]
+    if not there:  # MASTER_ADDR and MASTER_PORT may be set for all programs of a machine
+        return False
+    missing = [name for name in (*OF_A_PROCESS, "MASTER_ADDR", "MASTER_PORT") if name not in os.environ]
+    if missing:
+        raise TrainerError(f"{', '.join(there)} {'is' if len(there) == 1 else 'are'} set and {', '.join(missing)} not; "
+                           f"torchrun sets all of them: start with it, or unset {', '.join(there)}")
+    size = _number("WORLD_SIZE", 1, MOST_PROCESSES)
+    _number("RANK", 0, size - 1, f": WORLD_SIZE is {size}")
+    _number("LOCAL_RANK", 0, size - 1, f": WORLD_SIZE is {size}")
+    _number("MASTER_PORT", 1, 2**16 - 1)
+    return True
+
+
+def _number(name: str, least: int, most: int, why: str = "") -> int:
+    """What a variable of torchrun says. Raises TrainerError."""
+    text = os.environ[name]
+    number = int(text) if re.fullmatch(r"\d{1,9}", text, re.ASCII) else -1
+    if not least <= number <= most:
+        raise TrainerError(f"{name} is {text!r}; it must be a whole number from {least} to {most}{why}, as torchrun "
+                           "sets it")
+    return number
 
 
 def join_group(device: str) -> Group:
     """The group of this process, which torchrun has started or nobody; on CUDA each takes the GPU of its local rank.
 
-    Raises TrainerError where the host has fewer GPUs than torchrun has started processes there.
+    Raises TrainerError where the host has fewer GPUs than torchrun has started processes there, and where the
+    processes do not meet.
     """
     if not launched_by_torchrun():
         return ALONE
@@ -131,7 +162,20 @@ def join_group(device: str) -> Group:
             raise TrainerError(f"torchrun has started process {place} of this host, which has {gpus} GPUs; each "
                                "process needs one: --nproc-per-node must be at most that")
         torch.cuda.set_device(place)
-    torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo", timeout=TIMEOUT)
+    where = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+    said = threading.Timer(PATIENCE, lambda: print(
+        f"note: process {os.environ['RANK']} of {os.environ['WORLD_SIZE']} waits for the others at {where}",
+        file=sys.stderr, flush=True))
+    said.daemon = True
+    said.start()
+    try:
+        torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo", timeout=TIMEOUT)
+    except (RuntimeError, ValueError, OSError) as error:
+        first = str(error).strip().partition("\n")[0]
+        raise TrainerError(f"the processes of the training do not meet at {where} (MASTER_ADDR and MASTER_PORT): "
+                           f"{first}") from error
+    finally:
+        said.cancel()
     return DistributedGroup()
 
 

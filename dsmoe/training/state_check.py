@@ -78,8 +78,8 @@ def check_state(state: Dict[str, Any], config: TrainConfig, strategy: Dict[str, 
 
     _require(isinstance(state["history"], list) and all(isinstance(row, dict) for row in state["history"]), "history",
              state["history"], "a list of evaluations")
-    _require(all(_is_whole(step) and _is_number(loss) for step, loss in state["losses"]), "losses", state["losses"],
-             "pairs of an iteration and a loss")
+    _require(all(_is_whole(step) and 0 <= step <= iteration and _is_number(loss) for step, loss in state["losses"]),
+             "losses", state["losses"], "pairs of an iteration and a loss")
 
 
 def check_model(state: Dict[str, Any], config: TrainConfig) -> None:

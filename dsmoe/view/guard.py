@@ -3,15 +3,19 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import math
 import socket
-from typing import Any, Iterator, Optional
+from typing import Any, Callable, Iterator, Optional
 
-from ..errors import TrainerError
+from ..errors import TrainerError, printable
 
 MOST_SAID = 20  # refusals that are printed
 # The fields of a browser's camera, and how many numbers each has.
 CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3, "fov": 1, "near": 1, "far": 1, "image_width": 1,
           "image_height": 1}
+WHOLE = ("image_width", "image_height")  # which viser makes whole numbers
+Takes = Callable[[str, Any], bool]
+"""Whether the control with this identifier takes a value."""
 
 
 def refusal(origin: Optional[str], host: Optional[str], served_at: str) -> Optional[str]:
@@ -45,7 +49,7 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def is_wanted(message: Any) -> bool:
+def is_wanted(message: Any, takes: Takes) -> bool:
     """Whether the viewer passes a browser's message on: that a camera has moved, or that a control has another value.
 
     viser knows more: it sets any attribute of a control that a message names, takes files, and asks a server of its
@@ -54,11 +58,13 @@ def is_wanted(message: Any) -> bool:
     if not isinstance(message, dict):
         return False
     if message.get("type") == "ViewerCameraMessage":
-        return all(_has_numbers(message[name], count) for name, count in CAMERA.items() if name in message)
+        return all(_has_numbers(message[name], count) for name, count in CAMERA.items() if name in message) and all(
+            math.isfinite(message[name]) for name in WHOLE if name in message)
     if message.get("type") == "GuiUpdateMessage":
         updates = message.get("updates")
         return isinstance(updates, dict) and set(updates) == {"value"} and isinstance(
-            updates["value"], (bool, int, float, str)) and isinstance(message.get("uuid"), str)
+            updates["value"], (bool, int, float, str)) and isinstance(message.get("uuid"), str) and takes(
+            message["uuid"], updates["value"])
     return False
 
 
@@ -69,10 +75,11 @@ def _has_numbers(value: Any, count: int) -> bool:
 
 
 @contextlib.contextmanager
-def only_own_pages(served_at: str) -> Iterator[None]:
+def only_own_pages(served_at: str, takes: Takes) -> Iterator[None]:
     """A viser server that is started inside refuses what `refusal` names, and the terminal says so.
 
-    Messages that are not wanted are dropped. viser checks nothing and has no option for it. So the function by which it
+    Messages that are not wanted are dropped. A browser whose message viser cannot read all the same is left, and a line
+    says so. viser checks nothing and has no option for it. So the function by which it
     starts its server is replaced meanwhile.
     Raises TrainerError where this release of viser starts it in another way.
     """
@@ -102,11 +109,15 @@ def only_own_pages(served_at: str) -> Iterator[None]:
                 while True:
                     data = await receive(*arguments, **options)
                     with contextlib.suppress(Exception):  # what is no MessagePack is dropped too
-                        if is_wanted(msgspec.msgpack.decode(data)):
+                        if is_wanted(msgspec.msgpack.decode(data), takes):
                             return data
 
             connection.recv = next_wanted
-            await handle(connection)
+            try:
+                await handle(connection)
+            except Exception as error:
+                print(f"left a browser: its message cannot be read ({printable(f'{type(error).__name__}: {error}')})",
+                      flush=True)
 
         guarded.append(True)
         return original(filtered, *arguments, process_request=checked, **options)

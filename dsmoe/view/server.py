@@ -52,7 +52,8 @@ class Controls:
             self._only_what_matters()
             changed()
 
-        for control in (self.shown, self.mode, self.gate, self.beside, self.split, self.other_mode, self.other_gate):
+        self._all = (self.shown, self.mode, self.gate, self.beside, self.split, self.other_mode, self.other_gate)
+        for control in self._all:
             control.on_update(update)
 
     @staticmethod
@@ -65,6 +66,14 @@ class Controls:
         for control in (self.split, self.other_mode, self.other_gate):
             control.visible = self.beside.value
         self.other_gate.disabled = self.other_mode.value not in GATED_MODES
+
+    def take(self, uuid: str, value: Any) -> bool:
+        """Whether the control that viser knows by `uuid` takes a browser's value: a text or a number, as it has one.
+
+        viser makes the one of the other, and fails where a text is no number.
+        """
+        return any(control._impl.uuid == uuid and isinstance(value, str) == isinstance(control.value, str)
+                   for control in self._all)
 
     def follow(self, before: Blend, after: Blend) -> None:
         """Takes the background gate that a training has learned meanwhile, where nobody has set another."""
@@ -104,7 +113,7 @@ class Viewer:
         except ImportError as error:
             raise TrainerError(f"the viewer needs viser: {pip_install('viser')}") from error
         self.followed = followed
-        with only_own_pages(host):
+        with only_own_pages(host, lambda uuid, value: self.controls.take(uuid, value)):
             self.server = viser.ViserServer(host=host, port=port, label="dsmoe view", verbose=False)
         self.server.scene.set_up_direction(tuple(followed.orbit.up.tolist()))
         self.server.gui.configure_theme(show_share_button=False)

@@ -20,6 +20,7 @@ from packaged import packages_and_data
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import extension, reference
+from dsmoe import quickstart_options
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "diff_smoe_rasterization"
@@ -261,12 +262,25 @@ def test_quickstart_builds_no_kernels_where_there_is_no_gpu_unless_asked(tmp_pat
     assert said.split() == ["0", "1", "auto"]
 
 
-def test_quickstart_knows_before_it_builds_that_there_is_no_such_scene(tmp_path):
-    run = subprocess.run([str(ROOT / "quickstart"), "garden", "--iterations", "10"], cwd=str(tmp_path),
+@pytest.mark.parametrize("words, status, error", [
+    ("garden --iterations 10", 1, "error: scene garden: no such folder"),
+    ("--iterations 10 -o out garden", 1, "error: scene garden: no such folder"),
+    ("--iterations abc", 2, "argument --iterations: invalid int value: 'abc'"),
+    ("--iterations 0", 1, "error: --iterations is 0; it must be at least 1"),
+    ("--iterations", 2, "argument --iterations: expected one argument"),
+    ("--strategy none", 2, "argument --strategy"), ("--itertions 10", 2, "unrecognized arguments: --itertions"),
+    ("--blend-mode smoe", 2, "unrecognized arguments: --blend-mode"), ("--budget 2", 1, "--budget is 2")])
+def test_quickstart_knows_before_it_builds_what_is_wrong_with_its_options(tmp_path, words, status, error):
+    run = subprocess.run([str(ROOT / "quickstart"), *words.split()], cwd=str(tmp_path),
                          env={**os.environ, "DSMOE_VENV": "venv"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                          universal_newlines=True)
-    assert (run.returncode, run.stdout, run.stderr) == (1, "", "error: scene garden: no such folder\n")
+    assert (run.returncode, run.stdout) == (status, "") and error in run.stderr and "Traceback" not in run.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", ["", "--budget 100", "--budget 100 --iterations 60 --device cpu"])
+def test_options_of_quickstart_that_fit_are_taken(words, capsys):
+    assert quickstart_options.check(words.split()) == 0 and capsys.readouterr().err == ""
 
 
 def test_a_long_step_says_how_many_files_are_compiled(tmp_path):

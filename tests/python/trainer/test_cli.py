@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from io import BytesIO, TextIOWrapper
 
 import numpy as np
 import pytest
@@ -709,6 +710,28 @@ def test_names_of_images_need_not_be_utf_8(scene, tmp_path, capsys):
     assert main(["eval", output]) == 0 and main(["render", output, "-o", str(tmp_path / "images")]) == 0
     assert "view_000\\udce9.png" in os.listdir(tmp_path / "images"), "in letters that every system has"
     assert main(["export", output, "-o", str(tmp_path / "a.html")]) == 0
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_names_that_a_terminal_cannot_print_end_no_command(scene, tmp_path, monkeypatch, encoding):
+    """Folders and files of any bytes, on a stream that takes none of them."""
+    monkeypatch.chdir(tmp_path)
+    folder, run, name = (os.fsdecode(text) for text in (b"scene\xff", b"run\xff", b"a\xff"))
+    shutil.copytree(scene, folder)
+    streams = [TextIOWrapper(BytesIO(), encoding, errors="strict") for _ in range(2)]
+    monkeypatch.setattr(sys, "stdout", streams[0])
+    monkeypatch.setattr(sys, "stderr", streams[1])
+    for words in (["train", folder, "-o", run, *SHORT], ["eval", run], ["render", run, "-o", name],
+                  ["render", run, "--orbit", "--frames", "1", "-o", name + ".gif"],
+                  *(["export", run, "-o", f"{name}.{form}"] for form in ("html", "ply", "splat", "glb")),
+                  ["train", "--resume", run]):
+        assert main(words) == 0, words
+    assert main(["eval", name]) == 1 and main(["export", name + ".ply", "-o", name + ".ply"]) == 1
+    for stream in streams:
+        stream.seek(0)
+    out, errors = (stream.buffer.read() for stream in streams)
+    assert (b"export 'run\xff' -o" if encoding == "utf-8" else b"export 'run\\udcff' -o") in out
+    assert errors.count(b"\n") == 2 and b"a\\udcff holds no config.json" in errors
 
 
 def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):

@@ -2,7 +2,9 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -18,7 +20,9 @@ from dsmoe.cli import main
 from dsmoe.distributed.shards import run_of
 from dsmoe.errors import TrainerError
 from dsmoe.results.modelfile import model_path
+from dsmoe.system import group as group_module
 from dsmoe.system import torchrun as torchrun_module
+from dsmoe.system.group import ALONE, join_group
 from dsmoe.train import train
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -147,6 +151,58 @@ def test_gpus_starts_torchrun_with_the_same_command(tiny_config, monkeypatch):
     command = torchrun_module.torchrun_command(2, words)
     assert command[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
     assert command[6:] == ["-m", "dsmoe", *words]
+
+
+TORCHRUN = {"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
+
+
+@pytest.mark.parametrize("changes, words", [
+    *((dict.fromkeys({*TORCHRUN} - {name}), f"{name} is set and .* not; torchrun sets all of them")
+      for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK")),
+    *(({name: None}, rf"are set and {name} not; torchrun sets all of them: start with it, or unset RANK, WORLD_SIZE"
+       ) for name in ("MASTER_ADDR", "MASTER_PORT")),
+    ({"LOCAL_RANK": None}, "RANK, WORLD_SIZE are set and LOCAL_RANK not; torchrun sets all"),
+    ({"RANK": "x"}, "RANK is 'x'; it must be a whole number from 0 to 0"),
+    ({"RANK": "5"}, "RANK is '5'; it must be a whole number from 0 to 0: WORLD_SIZE is 1"),
+    ({"RANK": "-1", "WORLD_SIZE": "4"}, "RANK is '-1'; it must be a whole number from 0 to 3"),
+    *(({"WORLD_SIZE": value}, f"WORLD_SIZE is '{value}'; it must be a whole number from 1 to 1000000")
+      for value in ("0", "-1", "", "1.5", "9" * 5000, "\u0661")),
+    ({"LOCAL_RANK": "1"}, "LOCAL_RANK is '1'; it must be a whole number from 0 to 0"),
+    *(({"MASTER_PORT": value}, f"MASTER_PORT is '{value}'; it must be a whole number from 1 to 65535")
+      for value in ("-4", "0", "65536", "port")),
+])
+def test_variables_of_torchrun_that_cannot_be_are_named(tiny_config, monkeypatch, capsys, changes, words):
+    for name, value in {**TORCHRUN, **changes}.items():
+        monkeypatch.delenv(name, raising=False)
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    assert main(["train", tiny_config.scene, "-o", tiny_config.output]) == 1
+    text = capsys.readouterr().err
+    assert re.search(words, text) and text.count("\n") == 1
+    assert not os.path.exists(tiny_config.output)
+
+
+def test_an_address_of_all_programs_is_no_torchrun(monkeypatch):
+    for name in TORCHRUN:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
+    monkeypatch.setenv("MASTER_PORT", "any")
+    assert join_group("cpu") is ALONE
+
+
+@needs_gloo
+def test_processes_that_do_not_meet_say_so(monkeypatch, capsys):
+    """The second of two, where the first never comes: a line while it waits, another one at its end."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    for name, value in {**TORCHRUN, "RANK": "1", "WORLD_SIZE": "2", "MASTER_PORT": str(port)}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(group_module, "TIMEOUT", datetime.timedelta(seconds=1.5))
+    monkeypatch.setattr(group_module, "PATIENCE", 0.1)
+    with pytest.raises(TrainerError, match=f"the processes of the training do not meet at 127.0.0.1:{port} .*: ."):
+        join_group("cpu")
+    assert capsys.readouterr().err.startswith(f"note: process 1 of 2 waits for the others at 127.0.0.1:{port}\n")
 
 
 def test_more_gpus_than_there_are_is_refused(monkeypatch):

@@ -1,9 +1,12 @@
 """Rows that are drawn by weights, also where torch.multinomial takes no more rows."""
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
+from dsmoe.errors import TrainerError
 from dsmoe.training import drawing
 
 WEIGHTS = torch.tensor([0.0, 1.0, 2.0, 0.0, 5.0, 0.0])
@@ -21,6 +24,12 @@ def test_rows_come_as_often_as_their_weights_say(most, monkeypatch):
         # Five standard deviations of a share of so many draws, at the most 0.5 / sqrt(count).
         torch.testing.assert_close(found, WEIGHTS / 8, rtol=0, atol=2.5 / count ** 0.5)
         assert (found[WEIGHTS == 0] == 0).all()
+
+
+@pytest.mark.parametrize("weight", [math.nan, math.inf, 0.0])
+def test_weights_of_a_diverged_training_are_told(weight):
+    with pytest.raises(TrainerError, match="the training has diverged: .* lower the learning rates"):
+        drawing.draw(torch.tensor([0.0, weight, 0.0]), 1)
 
 
 def test_more_rows_than_torch_draws_of():

@@ -1,8 +1,10 @@
 """Photographs to a scene by COLMAP: real ones find their known places, and what goes wrong is said."""
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import sqlite3
 import sys
 
 import numpy as np
@@ -15,6 +17,7 @@ from diff_smoe_rasterization import io
 from dsmoe import photos
 from dsmoe.cli import main
 from dsmoe.config import TrainConfig
+from dsmoe.errors import SceneError
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.output_folder import Record, write_record
 
@@ -92,6 +95,46 @@ def test_photographs_that_do_not_connect(tmp_path, capsys):
     assert not (tmp_path / "scene" / "sparse").exists()
 
 
+def test_features_are_found_anew_where_photographs_have_changed(tmp_path):
+    """A photograph that has changed under its name, that has gone, or another camera model; one more is welcome."""
+    pytest.importorskip("pycolmap", reason="pip install pycolmap")
+    random, pictures, said = np.random.RandomState(0), tmp_path / "photos", []
+    pictures.mkdir()
+
+    def picture(name, size=(80, 60)):
+        Image.fromarray(random.randint(0, 255, (*size[::-1], 3), np.uint8)).save(pictures / name)
+
+    def features(camera_model="OPENCV"):
+        """The descriptors that COLMAP has by name, and whether it found all of them anew."""
+        said.clear()
+        with pytest.raises(SceneError, match="connect"):
+            photos.make_scene(str(pictures), str(tmp_path / "scene"), camera_model=camera_model, progress=False,
+                              say=said.append)
+        with contextlib.closing(sqlite3.connect(tmp_path / "scene" / "colmap" / photos.DATABASE)) as database:
+            found = dict(database.execute("SELECT name, data FROM images JOIN descriptors USING (image_id)"))
+        return found, said[0].startswith("photographs or camera model have changed")
+
+    for index in range(4):
+        picture(f"{index}.png")
+    first, anew = features()
+    assert len(first) == 4 and not anew
+    assert features() == (first, False)
+    picture("0b.png")
+    more, anew = features()
+    assert {*more} - {*first} == {"0b.png"} and not anew
+    before = os.stat(pictures / "2.png")
+    picture("2.png")
+    os.utime(pictures / "2.png", ns=(before.st_atime_ns, before.st_mtime_ns))
+    changed, anew = features()
+    assert {name for name in more if more[name] != changed[name]} == {"2.png"} and anew
+    (pictures / "3.png").unlink()
+    fewer, anew = features()
+    assert {*more} - {*fewer} == {"3.png"} and anew
+    assert features("PINHOLE")[1] and not features("PINHOLE")[1]
+    (tmp_path / "scene" / "colmap" / photos.FEATURES).write_text("damaged")
+    assert features("PINHOLE")[1]
+
+
 def test_an_interrupted_command_says_that_it_continues(tmp_path, capsys, monkeypatch):
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
@@ -107,6 +150,14 @@ def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", sys)
     (tmp_path / "walk.mp4").write_text("")
     assert "ffmpeg -i VIDEO" in fails(capsys, tmp_path / "walk.mp4", "-o", tmp_path / "scene")
+    (tmp_path / "1.jpg").write_text("")
+    text = fails(capsys, tmp_path / "1.jpg", "-o", tmp_path / "scene")
+    assert f"1.jpg is a file; name the folder of the photographs, such as {tmp_path}\n" in text
+    (tmp_path / "1.jpg").unlink()
+    (tmp_path / "link").symlink_to(tmp_path)
+    for scene in (tmp_path, tmp_path / "link", tmp_path.parent, tmp_path / "."):
+        assert "lies in" in fails(capsys, tmp_path, "-o", scene)
+    (tmp_path / "link").unlink()
     (tmp_path / "IMG_1.HEIC").write_text("")
     text = fails(capsys, tmp_path, "-o", tmp_path / "scene")
     assert "0 photographs" in text and "at least 3" in text and "IMG_1.HEIC is of a kind that COLMAP does not" in text

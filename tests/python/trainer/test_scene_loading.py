@@ -340,7 +340,8 @@ def test_transforms_with_points_masks_and_listed_images(transforms_folder):
     np.testing.assert_array_equal(scene.points.positions, positions)
     assert [view.camera.name[-5] for view in scene.train] == list("012345")
     assert [view.camera.name[-5] for view in scene.test] == list("78")
-    assert scene.split == "transforms.json lists the test images" and scene.train[0].mask.shape == (1, 10, 20)
+    assert scene.split == "transforms.json lists the test images, 2 images are in neither list"
+    assert scene.train[0].mask.shape == (1, 10, 20)
     for names, train, test in ((["train"], "012345", "6789"), (["test"], "0123456" + "9", "78"),
                                (["val"], "012345" + "789", "6")):
         left = json.loads((transforms_folder / "transforms.json").read_text())
@@ -355,6 +356,12 @@ def test_transforms_with_points_masks_and_listed_images(transforms_folder):
         assert ["".join(view.camera.name[-5] for view in views) for views in (scene.train, scene.test)] == [train, test]
     edit_json(transforms_folder / "transforms.json", lambda content: content.update(test_filenames=["images/no.jpg"]))
     refused(transforms_folder, "transforms.json", "`test_filenames` names images/no.jpg, which is no frame")
+
+
+@pytest.mark.parametrize("value", [-1, True, ["sparse_pc.ply"], float("nan"), {}])
+def test_points_of_no_name_are_not_made_up(transforms_folder, value):
+    edit_json(transforms_folder / "transforms.json", lambda content: content.update(ply_file_path=value))
+    refused(transforms_folder, "`ply_file_path` is ", "must be the name of a file")
 
 
 def write_masks(folder, size=(32, 24), name="{}.png", value=255):
@@ -573,9 +580,18 @@ def test_a_truncated_binary_file(colmap_folder, name):
     refused(colmap_folder, name + ".bin")
 
 
-def test_a_missing_model_file(colmap_folder):
-    os.remove(os.path.join(colmap_folder, "sparse", "0", "images.txt"))
-    refused(colmap_folder, "images.txt")
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_missing_model_file(colmap_folder, name, text):
+    model = io.read_colmap(colmap_folder)
+    shutil.rmtree(model.folder)
+    io.write_colmap(model.folder, model, text=text)
+    path = os.path.join(model.folder, name + (".txt" if text else ".bin"))
+    os.remove(path)
+    with pytest.raises(SceneError) as error:
+        load(colmap_folder)
+    words = "no COLMAP model here: neither cameras.bin" if name == "cameras" else f"{path}: no such file"
+    assert words in str(error.value) and "Errno" not in str(error.value)
 
 
 def test_an_empty_model(colmap_folder):
@@ -640,6 +656,22 @@ def test_both_files_of_a_nerf_scene_may_list_an_image_and_the_split_says_so(nerf
     assert scene.split == "transforms_test.json lists the test images, 1 of which are training images too"
 
 
+@pytest.mark.parametrize("small", [1e-300, 5e-324, 1e-10, 0.0, -1.0])
+def test_focal_lengths_that_show_nothing(any_scene, small):
+    """What a COLMAP reader lets through too: below a billionth of a pixel."""
+    folder, _ = any_scene
+    if os.path.isdir(os.path.join(folder, "sparse")):
+        model = io.read_colmap(folder)
+        for text in (True, False):
+            model.cameras[1].params[:2] = (small, 30) if text else (30, small)
+            io.write_colmap(model.folder, model, text=text)
+            refused(folder, "focal length")
+        return
+    for name in {*os.listdir(folder)} & {"transforms.json", "transforms_train.json"}:
+        edit_json(pathlib.Path(folder, name), lambda content: content.update(fl_x=small))
+    refused(folder, "`fl_x`", "must be positive, 1e-09 at least")
+
+
 @pytest.mark.parametrize("large", [1e300, -2e9])
 def test_cameras_that_float32_cannot_hold(colmap_folder, large):
     model = io.read_colmap(colmap_folder)
@@ -683,6 +715,8 @@ def frame(**values):
     (frame(file_path="./train/r_9"), ["r_9.png", "no such image"]),
     (frame(transform_matrix=[[1, 2], [3, 4]]), ["frame 0", "transform_matrix"]),
     (frame(transform_matrix=[[1, 0, 0, 0]] * 3 + [[0, 0, 0, "x"]]), ["frame 0", "transform_matrix"]),
+    (frame(transform_matrix=np.eye(4)[[3, 0, 1, 2]].tolist()), ["frame 0", "last row", "must be 0, 0, 0, 1"]),
+    (frame(camera_model=""), ["frame 0", "`camera_model` is ''", "OPENCV"]),
     (frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), ["frame 0", "rotation"]),
     (frame(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), ["frame 0", "mirrors", "rotation"]),
     (frame(transform_matrix=[[10**400] * 4] * 4), ["frame 0", "transform_matrix"]),
