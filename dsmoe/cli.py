@@ -314,7 +314,7 @@ def _view(arguments: argparse.Namespace) -> None:
     _choose_device(arguments)
     viewer = Viewer(Followed(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                              **_overrides(arguments)), arguments.host, arguments.port)
-    print(f"{viewer.address}: open it in a browser; Ctrl-C ends", flush=True)
+    print(f"{viewer.address}/?darkMode: open it in a browser; Ctrl-C ends", flush=True)
     viewer.wait()
 
 

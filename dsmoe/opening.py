@@ -10,7 +10,7 @@ from .inspection import open_renderer, open_run
 from .model import GaussianModel
 from .results.rendering import Renderer
 from .scenes.cameras import Camera
-from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points
+from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import load_cameras
 from .system.device import check_device
 from .system.files import is_file, is_folder
@@ -23,7 +23,7 @@ class Trained:
     config: TrainConfig  # the run's; of a .ply only background, resolution and scene mean something
     path: str  # the .ply; of a training that has not ended, the checkpoint
     renderer: Renderer
-    cameras: List[Camera]  # of the scene's test views, else of its training views; one on the orbit without a scene
+    cameras: List[Camera]  # the scene's test views, else its training views, upright; one on the orbit without a scene
     orbit: Orbit
     has_ended: bool = True  # the training
 
@@ -58,11 +58,14 @@ def check_source(source: str, besides: str = "") -> None:
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:
     """Where a model is looked at from: the test views of config.scene, else its training views, and their orbit.
 
+    The views are upright: photographs are often tilted.
+
     Where the scene is not there, it is an orbit about the Gaussians and one camera on it. needed: raise TrainerError
     then.
     """
     if needed or is_folder(config.scene):
         every = load_cameras(config, "all")
-        return load_cameras(config, "test") or every, orbit_of_cameras(every)
+        orbit = orbit_of_cameras(every)
+        return [upright(camera, orbit.up) for camera in load_cameras(config, "test") or every], orbit
     orbit = orbit_of_points(model.raw["means3D"].detach().cpu().double().numpy())
     return orbit.cameras(1, default_camera()), orbit

@@ -52,6 +52,33 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward])
 
 
+def upright(camera: Camera, up: np.ndarray) -> Camera:
+    """The camera without its roll: it looks in the same direction, and what is up [3] is up in its image.
+
+    One that looks up or down within 8 degrees has no such direction, and stays.
+    """
+    forward = camera.rotation[2]
+    if abs(forward @ up) > math.cos(math.radians(8)):
+        return camera
+    rotation = look_at(camera.center, camera.center + forward, up)
+    return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ camera.center)
+
+
+def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray:
+    """[3] unit: what is up in the world, if photographers hold their cameras level.
+
+    It is perpendicular to the horizontal axes of the images, however high or low the cameras look. Where these axes
+    run parallel, or cameras are turned by 90 degrees, it is the mean of the images' vertical axes.
+    """
+    mean = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    mean = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 1e-3 else np.array([0.0, 0.0, 1.0])
+    sizes, axes = np.linalg.eigh(np.mean([np.outer(camera.rotation[0], camera.rotation[0]) for camera in cameras],
+                                         axis=0))  # the sizes ascend
+    level = axes[:, 0] * (1.0 if axes[:, 0] @ mean > 0 else -1.0)
+    is_sure = sizes[1] > 0.01 and sizes[0] < sizes[1] / 4 and level @ mean > math.cos(math.radians(45))
+    return level if is_sure else mean
+
+
 def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
     """The orbit of a capture: as far from the target and as high above it as the cameras are on average.
 
@@ -60,8 +87,7 @@ def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
     """
     centers = np.stack([camera.center for camera in cameras])
     forwards = np.stack([camera.rotation[2] for camera in cameras])
-    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
+    up = up_of_cameras(cameras)
     # Sum of (I - d d^T)(p - c) over the axes is 0.
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
     matrix = across.sum(axis=0)

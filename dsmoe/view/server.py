@@ -9,7 +9,7 @@ import contextlib
 import math
 import threading
 import time
-from typing import Any, Dict, Optional, Sequence
+from typing import Any, Dict, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES, MAX_BACKG
 
 from ..choices import VIEW_HOST, VIEW_PORT
 from ..errors import TrainerError
+from ..inspection import to_image
 from ..scenes.cameras import Camera, quaternion_to_rotation
 from ..system.process import pip_install
 from ..system.stopwatch import synchronised_time
@@ -116,7 +117,13 @@ class Viewer:
         with only_own_pages(host, lambda uuid, value: self.controls.take(uuid, value)):
             self.server = viser.ViserServer(host=host, port=port, label="dsmoe view", verbose=False)
         self.server.scene.set_up_direction(tuple(followed.orbit.up.tolist()))
-        self.server.gui.configure_theme(show_share_button=False)
+        self.server.gui.configure_theme(dark_mode=True, show_share_button=False)
+        # A browser shows these until its first picture arrives, not the white of an empty scene from anywhere.
+        self.server.scene.set_background_image(np.asarray(to_image(followed.renderer.background[:, None, None])))
+        if hasattr(self.server, "initial_camera"):  # of viser 1.0.1 on
+            begin = self.server.initial_camera
+            begin.up = tuple(followed.orbit.up.tolist())
+            begin.fov, begin.position, begin.look_at = self._first_view()
         self.controls = Controls(self.server.gui, Blend.of(followed.renderer), self._all_changed)
         self._clients: Dict[int, _Client] = {}
         self._wake = threading.Event()
@@ -146,17 +153,22 @@ class Viewer:
         if self._error:
             raise self._error
 
-    def _connected(self, handle: Any) -> None:
-        client = self._clients[handle.client_id] = _Client(handle)
-        handle.camera.on_update(lambda _: self._moved(client))
+    def _first_view(self) -> Tuple[float, np.ndarray, np.ndarray]:
+        """Where it begins: the vertical field of view in radians, the camera's place [3], and what it looks at [3]."""
         first, orbit = self.followed.cameras[0], self.followed.orbit
         forward = first.rotation[2]
         distance = max(float(forward @ (orbit.target - first.center)), 0.1)
+        return 2 * math.atan(first.height / (2 * first.fy)), first.center, first.center + distance * forward
+
+    def _connected(self, handle: Any) -> None:
+        client = self._clients[handle.client_id] = _Client(handle)
+        handle.camera.on_update(lambda _: self._moved(client))
+        fov, position, target = self._first_view()
         with contextlib.suppress(Exception):  # viser goes from the browser's camera, which may be anything
-            handle.camera.fov = 2 * math.atan(first.height / (2 * first.fy))
-            handle.camera.up_direction = orbit.up
-            handle.camera.position = first.center
-            handle.camera.look_at = first.center + distance * forward
+            handle.camera.fov = fov
+            handle.camera.up_direction = self.followed.orbit.up
+            handle.camera.position = position
+            handle.camera.look_at = target
         self._moved(client)
 
     def _moved(self, client: _Client) -> None:

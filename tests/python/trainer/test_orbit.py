@@ -16,7 +16,7 @@ from dsmoe.errors import SceneError
 from dsmoe.inspection import to_image
 from dsmoe.opening import open_trained
 from dsmoe.results.video import write_video
-from dsmoe.scenes.orbit import default_camera, look_at, orbit_of_cameras, orbit_of_points
+from dsmoe.scenes.orbit import default_camera, look_at, orbit_of_cameras, orbit_of_points, upright
 
 
 def ring(target, up, count=7):
@@ -41,6 +41,37 @@ def test_an_orbit_of_a_ring_is_that_ring(up):
     assert np.allclose(orbit.up, np.asarray(up) / np.linalg.norm(up))
     for mine, theirs in zip(orbit.cameras(7, cameras[0]), cameras):
         assert np.allclose(mine.center, theirs.center) and np.allclose(mine.rotation, theirs.rotation)
+
+
+def rolled(camera, angle):
+    """The camera turned about its viewing axis by an angle in radians."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) @ camera.rotation
+    return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ camera.center)
+
+
+@pytest.mark.parametrize("up", [[0, 1, 0], [0, 0, -1], [1, 2, -1]])
+def test_half_a_ring_of_tilted_photographs_has_its_up_and_is_turned_upright(up):
+    """All look down by 27 degrees to one side, where the mean of the images' vertical axes leans."""
+    up = np.asarray(up) / np.linalg.norm(up)
+    level = ring(np.array([1.0, -2.0, 0.5]), up, count=40)[:20]
+    assert np.allclose(orbit_of_cameras(level).up, up)
+    tilts = np.radians(12) * np.sin(np.arange(20))
+    tilted = [rolled(camera, angle) for camera, angle in zip(level, tilts)]
+    found = orbit_of_cameras(tilted).up
+    assert np.degrees(math.acos(min(1.0, found @ up))) < 3  # their mean tilt and how it is spread
+    for camera, straight in zip(tilted, level):
+        turned = upright(camera, up)
+        assert np.allclose(turned.rotation, straight.rotation) and np.allclose(turned.center, camera.center)
+    down = dataclasses.replace(level[0], rotation=look_at(up * 5, np.zeros(3), np.roll(up, 1)))
+    assert upright(down, up) is down
+
+
+def test_photographs_of_both_formats_have_the_up_of_most():
+    """A camera that is held upright has another one's vertical axis as its horizontal one."""
+    up = np.array([0.0, 0.0, 1.0])
+    cameras = [rolled(camera, math.pi / 2 * (index % 3 == 0)) for index, camera in enumerate(ring(np.zeros(3), up, 30))]
+    assert orbit_of_cameras(cameras).up @ up > 0.9
 
 
 def test_cameras_side_by_side_have_their_target_in_front():

@@ -329,9 +329,12 @@ def test_a_browser_shows_the_rendering_of_its_camera(model, browser, tmp_path): 
 
     viewer = Viewer(Followed(model), port=0)
     try:
-        browser.open(viewer.address, 900, 500)
-        browser.wait_until("document.querySelector('canvas') && document.body.innerText.includes('60 Gaussians')")
+        browser.open(viewer.address + "/?darkMode", 900, 500)
+        browser.wait_until("!!document.querySelector('canvas')")
+        assert np.asarray(browser.picture())[PART].mean() < 200, "it begins with the model's background, and not white"
+        browser.wait_until("document.body.innerText.includes('60 Gaussians')")
         client, = viewer._clients.values()
+        np.testing.assert_allclose(viewer.server.initial_camera.position, viewer.followed.cameras[0].center)
         shot = settled(browser, client, viewer)
         assert psnr(shot, expected(viewer, client, camera_of)) > 35  # the browser scales it to its canvas
         viewer.controls.mode.value = "alpha"
