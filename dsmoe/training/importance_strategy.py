@@ -106,6 +106,10 @@ class ImportanceStrategy(SteadyStrategy):
         return torch.cat([((part[:, None] - self.cameras).square().sum(2) < self.free_radii.square()).any(1)
                           for part in parts])
 
+    def is_of_few(self) -> torch.Tensor:
+        """[N] which Gaussians few views need; of fewer views that a decision looks at, as small a part."""
+        return self.needed * len(self.context.views) < self.options.needs * self.looks
+
     def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         if iteration <= self.moves_end or self.options.squares == 0:
             return super().loss(iteration, image, target)
@@ -166,9 +170,8 @@ class ImportanceStrategy(SteadyStrategy):
         ratio = model.num_gaussians / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
         self._look_at_the_rest()
-        few = self.needed * len(self.context.views) < self.options.needs * self.looks
-        scores = torch.where(few, -1 / self.costs, self.costs).masked_fill(self.is_near(), -math.inf)
-        mask = torch.zeros_like(few)
+        scores = torch.where(self.is_of_few(), -1 / self.costs, self.costs).masked_fill(self.is_near(), -math.inf)
+        mask = torch.zeros_like(self.costs, dtype=torch.bool)
         mask[torch.topk(scores, kept).indices] = True
         self.context.optimizer.keep(mask)
         self._forget_statistics()
@@ -176,12 +179,13 @@ class ImportanceStrategy(SteadyStrategy):
     def move(self) -> None:
         """Moves the cheapest Gaussians to others, drawn by their error, which are split there.
 
-        Those that float in front of a camera count as free of cost, and no other moves there.
+        Those that few views need and those that float in front of a camera count as free of cost, and no other moves to
+        the latter.
         """
         self._look_at_the_rest()
         count = int(self.options.moves * len(self.costs))
         near = self.is_near()
-        costs, sources = torch.topk(self.costs.masked_fill(near, 0), count, largest=False)
+        costs, sources = torch.topk(self.costs.masked_fill(near | self.is_of_few(), 0), count, largest=False)
         errors = self.errors.masked_fill(near, 0)
         self._forget_looks()
         errors[sources] = 0

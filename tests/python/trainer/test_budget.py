@@ -256,12 +256,12 @@ def test_removal_first_takes_what_two_views_or_fewer_need(tiny_config):
 
 
 def floating(trainer, rows):
-    """Puts Gaussians a little nearer to a camera each than half the distance behind which its points begin, and one a
-    little farther away. Returns that one."""
+    """Puts Gaussians a little nearer to a camera each than 0.3 of the distance behind which its points begin, and one
+    a little farther away. Returns that one."""
     raw, views = trainer.model.raw, trainer.scene.train
     points = raw["means3D"].detach().clone()
     with torch.no_grad():
-        for index, (row, part) in enumerate(zip([*rows, 0], [0.49] * len(rows) + [0.52])):
+        for index, (row, part) in enumerate(zip([*rows, 0], [0.29] * len(rows) + [0.32])):
             center = torch.tensor(views[index % len(views)].camera.center, dtype=torch.float32)
             distances, order = (points - center).norm(dim=1).sort()
             begins = distances[max(1, len(points) // 100) - 1]
@@ -293,10 +293,25 @@ def test_what_floats_in_front_of_a_camera_moves(tiny_config, monkeypatch):
     floating(trainer, [20, 50])
     strategy.costs, strategy.errors, strategy.sought = torch.full((count,), 5.0), torch.zeros(count), {}
     strategy.costs[20], strategy.errors[[3, 50]] = 1e6, torch.tensor([10.0, 1e6])
+    strategy.needed += len(trainer.scene.train)
     moved = []
     monkeypatch.setattr(strategy, "split", lambda parents, places: moved.append((parents.tolist(), places.tolist())))
     strategy.move()
     assert moved[0][0] == [3] and moved[0][1][0] in (20, 50)
+
+
+@pytest.mark.parametrize("settings, expected", [("near=0", ([3], [11])), ("near=0,needs=0", ([], []))])
+def test_what_two_views_or_fewer_need_moves(tiny_config, monkeypatch, settings, expected):
+    """Whatever it costs; what three need does not, and needs=0 moves neither."""
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60, strategy_options=settings)
+    strategy, count = trainer.strategy, trainer.model.num_gaussians
+    strategy.costs, strategy.errors, strategy.sought = torch.full((count,), 5.0), torch.zeros(count), {}
+    strategy.costs[11], strategy.errors[3], strategy.needed = 1e6, 10.0, torch.full((count,), 3.0)
+    strategy.needed[11] = 2
+    moved = []
+    monkeypatch.setattr(strategy, "split", lambda parents, rows: moved.append((parents.tolist(), rows.tolist())))
+    strategy.move()
+    assert moved == [expected]
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
@@ -363,6 +378,7 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
     strategy, count = trainer.strategy, trainer.model.num_gaussians
     costs, errors = torch.full((count,), 5.0), torch.zeros(count)
     costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
+    strategy.needed += len(trainer.scene.train)
     errors[7] = 1e6  # the cheapest is no place for another one
     strategy.costs, strategy.errors = costs, errors
     monkeypatch.setattr(strategy, "_look_at_the_rest", lambda: None)
