@@ -429,9 +429,9 @@ def in_rectangle(splats, x, y, settings):
 
 
 def near_pairs(splats, x, y, counts):
-    """Returns which of the pairs that count [n, pixels] are near: alpha >= 1/255, within 3 sigma 1/1020. Others are faint.
+    """Returns which of the pairs that count [n, pixels] are near: alpha >= 1/255, within 3 sigma 1/1020.
 
-    Within 3 sigma fewer pairs are faint, so that faint Gaussians have a gradient.
+    Others are faint. Within 3 sigma fewer are, so that faint Gaussians have a gradient.
     """
     kernel = torch.exp(_power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y))
     alpha = splats.opacity[:, None] * kernel

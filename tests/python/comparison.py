@@ -105,9 +105,8 @@ def threshold_margin(scene):
             alpha = reference.pair_alphas(splats, x, y, counts)
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
         if leaves_out_faint(mode, settings.faint_below):
-            # A pair is near by its alpha, or by its kernel and a lower alpha, and such pairs have an early stop of their
-            # own. They decide in the pixels that they cover, and in others where one pair more, of 1/255, could cover
-            # them.
+            # A pair is near by its alpha, or by its kernel and a lower alpha. Such pairs have an early stop of their own.
+            # They decide in the pixels that they cover, and in others where one pair more, of 1/255, could cover them.
             near = reference.pair_alphas(splats, x, y, reference.near_pairs(splats, x, y, counts))
             in_core = torch.minimum(power - math.log(reference.KERNEL_KEPT), log_alpha - math.log(reference.CORE_MIN))
             by_near = [torch.maximum(log_alpha - math.log(reference.ALPHA_MIN), in_core),

@@ -91,8 +91,8 @@ BEHIND, IN_FRONT = (2.0, 2.0 + 1e-9), (2.0, 2.0 - 1e-9)
 
 @pytest.mark.parametrize("depths", [BEHIND, IN_FRONT], ids=["behind", "in front"])
 def test_a_tail_by_hand(function, depths):
-    """At the centre of a Gaussian of opacity 0.3 another one of 0.05, 16 pixels away, is a tail."""
-    o, background = (0.3, 0.05), (0.1, 0.2, 0.3)
+    """At the centre of a Gaussian of opacity 0.2 another one of 0.05, 16 pixels away, is a tail."""
+    o, background = (0.2, 0.05), (0.1, 0.2, 0.3)
     rendering, opacities, _ = line(function, o, depths, 16)
     # A sphere beside the axis is longer on the image, by its slope of 16 / 20.5.
     kernel = math.exp(-0.5 * 16 ** 2 / (15.7 * (1 + (16 / 20.5) ** 2) + 0.3))
@@ -112,6 +112,14 @@ def test_tails_count_below_a_gate_sum(function):
               for below in (0.0, 0.29, 0.31, 2.0)]
     assert torch.equal(images[0], images[1]) and torch.equal(images[2], images[3])
     assert (images[1] - images[2]).abs().min() > 1e-5
+
+
+def test_tails_below_what_8_bits_show_count_only_where_all_pairs_do(function):
+    """A tail of alpha 5e-7, between 2^-35 and 1/520200, beside a Gaussian of opacity 0.2."""
+    for below, counts in ((1.0, False), (2.0, True)):
+        images = [line(function, (0.2, opacity), BEHIND, 26, faint_below=below)[0].color[:, 0, 20]
+                  for opacity in (0.002, 0.0)]
+        assert bool((images[0] != images[1]).any()) == counts
 
 
 def near_weight(opacities, distance):
@@ -155,7 +163,7 @@ def test_equals_the_reference_on_both_sides_of_the_threshold(mode, channels):
     scene = random_scene(mode, 400, 61, 45, seed=6, scale=0.1, opacity=(0.01, 1.0), channels=channels, degree=1,
                          bg=background).with_settings(faint_below=0.9)
     wide = (op_results(scene)[1]["final_transmittance"] < 0).reshape(45, 61)
-    everywhere = rasterize(settings=scene.with_settings(faint_below=2.0).settings, **scene.inputs).color
+    everywhere = rasterize(settings=scene.with_settings(faint_below=1.0).settings, **scene.inputs).color
     nowhere = rasterize(settings=without_tails(scene).settings, **scene.inputs).color
     image, actual = gradients(rasterize, scene, ("alpha",))
     assert 0.1 < wide.double().mean() < 0.9

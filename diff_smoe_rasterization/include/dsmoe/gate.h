@@ -87,7 +87,7 @@ template <class Real> struct Gate {
 // One whose alpha is o G.
 template <class Real> struct UnclampedGate : Gate<Real> { static constexpr bool kClamps = false; };
 
-// The alpha of a pair that is a tail; 0 where it is strong, or below the least alpha of a tail. counts: by Cut::kStrong.
+// The alpha of a pair that is a tail; 0 where it is strong, or below tail_alpha (BlendRules). counts: by Cut::kStrong.
 template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> inside, Scalar<Real> tail_alpha) {
   using S = Scalar<Real>;
   const Mask<Real> felt = inside & (gate.logit >= Real(tail_alpha));
