@@ -54,7 +54,9 @@ ALPHA_MAX = _float32(0.99)  # no Gaussian is opaque, else T would reach 0 (3DGS)
 OPACITY_MAX = _float32(1e20)  # beyond, gradients by a place overflow in float32
 ALPHA_MIN = _float32(1 / 255)  # less changes no 8-bit image (3DGS)
 STRONG_MIN = _float32(1 / 2040)  # `smoe`: pairs of at least this alpha are blended; weaker ones are tails (authors)
-TAIL_MIN = 2.0**-35  # `smoe`: weaker tails are below half a float32 unit of STRONG_MIN, the least sum they could change
+CORE_MIN = _float32(1 / 1020)  # `smoe`: within 3 sigma, pairs of less alpha are faint
+TAIL_MIN = _float32(1 / 2040 / 255)  # `smoe`: weaker tails change no 8-bit image, as STRONG_MIN is the least sum there
+EVERY_TAIL_MIN = 2.0**-35  # the same where all pixels have all pairs: half a float32 unit of STRONG_MIN
 KERNEL_MIN = _float32(1e-5)  # other SMoE modes cut on G: faint pairs decide where gates are weak (paper's text)
 KERNEL_KEPT = _float32(math.exp(-4.5))  # G at 3 sigma: nearer, a background gate cuts nothing, or gradients would end
 TRANSMITTANCE_MIN = _float32(1e-4)  # a pixel this dark behind what it has is finished (3DGS)
@@ -427,12 +429,13 @@ def in_rectangle(splats, x, y, settings):
 
 
 def near_pairs(splats, x, y, counts):
-    """Returns which of the pairs that count [n, pixels] are near: alpha >= 1/255, or within 3 sigma. Others are faint.
+    """Returns which of the pairs that count [n, pixels] are near: alpha >= 1/255, within 3 sigma 1/1020.
 
-    Within 3 sigma no pair is faint, or a faint Gaussian would have no gradient.
+    Others are faint. Within 3 sigma fewer are, so that faint Gaussians have a gradient.
     """
     kernel = torch.exp(_power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y))
-    return counts & ((splats.opacity[:, None] * kernel >= ALPHA_MIN) | (kernel >= KERNEL_KEPT))
+    alpha = splats.opacity[:, None] * kernel
+    return counts & ((alpha >= ALPHA_MIN) | (kernel >= KERNEL_KEPT) & (alpha >= CORE_MIN))
 
 
 def wide_pixels(splats, x, y, near, settings, mode):
@@ -468,7 +471,8 @@ def tail_sum(splats, x, y, counts, alpha, settings, mode, wide):
         opacity = splats.opacity[:, None]
         power = _power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
         tail = opacity * torch.exp(power)
-        is_tail = (opacity > 0) & (power <= 0) & ~counts & in_rectangle(splats, x, y, settings) & (tail >= TAIL_MIN)
+        least = TAIL_MIN if leaves_out_faint(mode, settings.faint_below) else EVERY_TAIL_MIN
+        is_tail = (opacity > 0) & (power <= 0) & ~counts & in_rectangle(splats, x, y, settings) & (tail >= least)
         _, stopped = numerator(alpha, mode)
         transmittance = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)])[:len(alpha)]
         total = (tail * transmittance).masked_fill(~is_tail | stopped, 0).sum(0)

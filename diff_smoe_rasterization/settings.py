@@ -25,9 +25,9 @@ W = sum alpha_i T_i. In `smoe` the sums are of strong pairs, those of alpha >= 1
 Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. `smoe_eq7` sums all pairs
 of G >= 1e-5.
 
-A pair that counts is near where alpha >= 1/255, and everywhere within 3 sigma; else it is faint. Where the near pairs
-of a pixel have a gate sum of `faint_below` or more, only they are blended, and B is 0. That is 0.9 in `smoe`, and in
-`smoe_eq7` on request.
+A pair that counts is near where alpha >= 1/255, and within 3 sigma where alpha >= 1/1020; else it is faint. Where the
+near pairs of a pixel have a gate sum of `faint_below` or more, only they are blended, and B is 0. That is 0.25 in
+`smoe`, and in `smoe_eq7` on request.
 
 With a `background_gate` lambda > 0 the background is one more expert of both, behind all others:
 
@@ -43,7 +43,7 @@ _FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_eq7": None, "smoe_tn": 0.0, "s
 GATED_MODES = tuple(mode for mode, gate in _FIXED_GATES.items() if gate is None)
 """The blend modes that take a `background_gate`: `smoe` and `smoe_eq7`."""
 
-_FAINT_BELOW = {"smoe": 0.9}
+_FAINT_BELOW = {"smoe": 0.25}
 """The `faint_below` of a blend mode where the caller gives none; of the others it is 2: no pair is left out."""
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
@@ -90,7 +90,7 @@ class GaussianRasterizationSettings(NamedTuple):
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
     # `smoe` and `smoe_eq7`: faint pairs and tails count in pixels whose near pairs have a gate sum below this. 2: in
-    # all, as in the authors' program and in the text; slower. 0: in none. None: 0.9 in `smoe`, 2 in `smoe_eq7`.
+    # all, as in the authors' program and in the text; slower. 0: in none. None: 0.25 in `smoe`, 2 in `smoe_eq7`.
     # The other modes ignore it
     faint_below: Optional[float] = None
 

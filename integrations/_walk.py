@@ -77,7 +77,8 @@ class Walk:
             alpha = torch.exp(-0.5 * squared).mul_((opacity * listed[..., None])[..., None]).clamp_(max=0.99)
             alpha.masked_fill_((squared > reach[..., None]) | (squared < 0), 0)
             if self.wide is not None:
-                near = torch.clamp(2 * torch.log(opacity * 255), min=9)[..., None]  # alpha >= 1/255, or within 3 sigma
+                core = torch.clamp(2 * torch.log(opacity * 1020), max=9)  # within 3 sigma
+                near = torch.maximum(2 * torch.log(opacity * 255), core)[..., None]
                 alpha.masked_fill_((squared > near) & ~self.wide[tiles, None], 0)
             if self.mode == "smoe_std":
                 weight = alpha

@@ -137,7 +137,7 @@ def blend_tile(rows, x, y, settings, mode):
             skipped |= raw < (opacity * reference.KERNEL_KEPT).clamp(max=least)
         wide = torch.ones_like(raw[:, :1], dtype=torch.bool)
         if leaves_out_faint(mode, settings.faint_below):
-            near = raw >= (opacity * reference.KERNEL_KEPT).clamp(max=reference.ALPHA_MIN)
+            near = raw >= (opacity * reference.KERNEL_KEPT).clamp(min=reference.CORE_MIN, max=reference.ALPHA_MIN)
             near_alpha = raw.masked_fill(skipped | ~near, 0).clamp(max=reference.ALPHA_MAX)
             behind = torch.cumprod(1 - near_alpha, 1)
             in_front = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], 1)
@@ -160,7 +160,9 @@ def blend_tile(rows, x, y, settings, mode):
         background = gate * (1 - gate_sum)
         if mode == "smoe":
             with torch.no_grad():
-                tails = raw.masked_fill(~skipped | (power > 0) | (raw < reference.TAIL_MIN) | stopped, 0)
+                every = not leaves_out_faint(mode, settings.faint_below)
+                least = reference.EVERY_TAIL_MIN if every else reference.TAIL_MIN
+                tails = raw.masked_fill(~skipped | (power > 0) | (raw < least) | stopped, 0)
                 tails = (tails * transmittance).sum(1, keepdim=True)
                 background = background + tails.masked_fill(~wide, 0)
         total = gate_sum + background

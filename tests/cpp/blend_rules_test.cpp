@@ -33,7 +33,7 @@ TEST(BlendRules, LambdaCutsFaintPairsInSmoeEq7Only) {
 }
 
 TEST(BlendRules, WidePixelsAreThoseOfTheModeUnlessTheCallerSays) {
-  EXPECT_EQ(rules_of<double>(BlendMode::kSmoe).wide_below(), 0.9f);
+  EXPECT_EQ(rules_of<double>(BlendMode::kSmoe).wide_below(), 0.25f);
   EXPECT_TRUE(rules_of<double>(BlendMode::kSmoe).blends_near_first());
   EXPECT_FALSE(rules_of<double>(BlendMode::kSmoeEq7).blends_near_first());
   for (const BlendMode mode : {BlendMode::kSmoe, BlendMode::kSmoeEq7}) {
@@ -51,12 +51,16 @@ TEST(BlendRules, WidePixelsAreThoseOfTheModeUnlessTheCallerSays) {
 
 TEST(BlendRules, TailsReachFromTheLeastStrongPairToTheLeastThatIsFelt) {
   auto rules = rules_of<double>(BlendMode::kSmoe);
-  // A tail of alpha kTailAlpha lies where the squared distance is 2 log(opacity / kTailAlpha).
+  // A tail of alpha a lies where the squared distance is 2 log(opacity / a).
   const auto reach = [&] { return squared_reach(Cut::kStrong, 0.8, rules.alpha_min) + rules.tail_reach(); };
-  const double tails_end = 2 * std::log(0.8 / kTailAlpha);
-  EXPECT_NEAR(reach(), tails_end, 1e-6);
-  rules.alpha_min = 0.01;
-  EXPECT_NEAR(reach(), tails_end, 1e-6);
+  for (const float below : {kFaintBelow, kFaintEverywhere}) {
+    rules.faint_below = below;
+    const double tails_end = 2 * std::log(0.8 / (below < 1 ? 1 / (2040.0 * 255) : 0x1p-35));
+    for (const double alpha_min : {0.0, 0.01}) {
+      rules.alpha_min = alpha_min;
+      EXPECT_NEAR(reach(), tails_end, 1e-6);
+    }
+  }
   EXPECT_EQ(rules_of<double>(BlendMode::kSmoeEq7).tail_reach(), 0);
 }
 

@@ -117,7 +117,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     for_each_pair(config.blend.blends_near_first() && !wide, [&](int64_t i, S dx, S dy, S power, const Gate<S>& gate) {
       out.num_pairs += gate.counts;
       decide_stop(state, gate);
-      if (Blend<kMode>::kTails && wide) add_tail(state, tails, tail_of(gate, power <= S(0)));
+      if (Blend<kMode>::kTails && wide) add_tail(state, tails, tail_of(gate, power <= S(0), config.blend.tail_alpha()));
       const auto pair = Blend<kMode>::accumulate(state, gate);
       add_pair<double>(out.contributions[i], pair.contributes, brute_force_pixel_weight<S>(pixel), pair.weight, dx, dy);
       num_contributing += pair.contributes;

@@ -22,6 +22,7 @@ TEST(Thresholds, AreTheSameNumbersInEveryScalarType) {
 
 TEST(Thresholds, HaveTheirLogarithms) {
   EXPECT_DOUBLE_EQ(kLog2AlphaCut, std::log2(double(kAlphaCut)));
+  EXPECT_DOUBLE_EQ(kLog2CoreAlpha, std::log2(double(kCoreAlpha)));
   EXPECT_DOUBLE_EQ(kLog2CoreKernel, std::log2(double(kCoreKernel)));
   EXPECT_NEAR(kCoreKernel, std::exp(-4.5), 1e-9);  // a float32 of 0.01
 }

@@ -105,17 +105,17 @@ def threshold_margin(scene):
             alpha = reference.pair_alphas(splats, x, y, counts)
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
         if leaves_out_faint(mode, settings.faint_below):
-            # A pair is near by its alpha or by its kernel, and such pairs have an early stop of their own. They decide
-            # in the pixels that they cover, and in others where one pair more, of 1/255, could cover them.
+            # A pair is near by its alpha, or by its kernel and a lower alpha. Such pairs have an early stop of their own.
+            # They decide in the pixels that they cover, and in others where one pair more, of 1/255, could cover them.
             near = reference.pair_alphas(splats, x, y, reference.near_pairs(splats, x, y, counts))
-            by_near = [torch.maximum(log_alpha - math.log(reference.ALPHA_MIN),
-                                     power - math.log(reference.KERNEL_KEPT)),
+            in_core = torch.minimum(power - math.log(reference.KERNEL_KEPT), log_alpha - math.log(reference.CORE_MIN))
+            by_near = [torch.maximum(log_alpha - math.log(reference.ALPHA_MIN), in_core),
                        torch.log1p(-near).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN)]
             below = resolve_faint_below(mode, settings.faint_below)
             weight = reference.numerator(near, mode)[0].sum(0, keepdim=True)
             wide = weight < below
             distances = [distance.masked_fill(~wide, math.inf) for distance in distances]
-            distances += [distance.masked_fill(wide & (weight < 0.99 * below), math.inf) for distance in by_near]
+            distances += [distance.masked_fill(wide & (weight < 0.98 * below), math.inf) for distance in by_near]
             if below > 0:
                 distances.append(weight.clamp(min=1e-300).log() - math.log(below))
         nearest = torch.cat([torch.full_like(x, math.inf)[None]] + [distance.abs() for distance in distances]).min(0)[0]

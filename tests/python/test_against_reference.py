@@ -225,5 +225,7 @@ def test_the_core_has_the_constants_of_the_reference():
                 "low_pass": GaussianRasterizationSettings._field_defaults["low_pass"],
                 "compensation_floor": reference.COMPENSATION_MIN, "frustum_margin": reference.FRUSTUM_MARGIN,
                 "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE,
-                "core_kernel": reference.KERNEL_KEPT, "max_opacity": reference.OPACITY_MAX}
+                "core_kernel": reference.KERNEL_KEPT, "core_alpha": reference.CORE_MIN,
+                "tail_alpha": reference.TAIL_MIN, "every_tail_alpha": reference.EVERY_TAIL_MIN,
+                "max_opacity": reference.OPACITY_MAX}
     assert {name: _core.constants[name] for name in expected} == expected

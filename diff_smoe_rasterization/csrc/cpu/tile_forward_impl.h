@@ -20,6 +20,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
       : tile_(tile),
         extent_(extent),
         num_features_(num_features),
+        tail_alpha_(tile.config.blend.tail_alpha()),
         transmittance_(scratch.pixels()),
         gate_sum_(scratch.pixels()),
         last_(scratch.pixels()),
@@ -142,7 +143,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
       for (EntryBits entries = met & ~smooth; entries != 0; entries &= entries - 1) {
         const int k = __builtin_ctz(entries);
         const PackPairs<kMode, S, false> pack(batch_[k], pixels, at);
-        const P otherwise = kTails ? -tail_of(pack.gate, pack.inside) : P(S(0));
+        const P otherwise = kTails ? -tail_of(pack.gate, pack.inside, tail_alpha_) : P(S(0));
         select(pack.gate.counts, pack.gate.alpha, otherwise).store(alphas_[k]);
       }
       open |= paint_pack<kTails>(met, at);
@@ -193,6 +194,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   const Tile<S>& tile_;
   const TileExtent& extent_;
   const int num_features_;
+  const S tail_alpha_;  // of BlendRules
   const PixelArray<S> transmittance_, gate_sum_, last_;
   const PixelArray<S> sums_;   // one array a feature
   const PixelArray<S> tails_;  // behind them, where the mode has tails

@@ -78,7 +78,10 @@ template <class S, BlendMode kMode, int kSums, int kPixels, bool kWide> struct B
     for (int k = 0; k < kPixels; ++k) {
       const S log_logit = exponent.at(below(dy, pixels.first + k));
       const auto gate = gaussian.gate.evaluate(log_logit);
-      if constexpr (kTails) add_tail(pixels.state[k], tails[k], tail_of(gate, gaussian.gate.inside(log_logit)));
+      if constexpr (kTails) {
+        const bool inside = gaussian.gate.inside(log_logit);
+        add_tail(pixels.state[k], tails[k], tail_of(gate, inside, arguments.tail_alpha));
+      }
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = fma(pair.weight, gaussian.features[f], pixels.sums[k][f]);
       pixels.last[k] = pair.contributes ? gaussian.seen : pixels.last[k];

@@ -34,7 +34,8 @@ template <class S> struct BlendArguments {
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
   bool marked;                // entries of lists are marked with quarters
   bool near_first;            // marks are by near pairs, and so are walks that are not wide
-  S wide_below, tail_reach;   // of BlendRules
+  S wide_below, tail_alpha;   // of BlendRules
+  S tail_reach;               // of BlendRules
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
@@ -50,6 +51,7 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   arguments.marked = marks_quarters(frame.inputs.num_gaussians);
   arguments.near_first = frame.config.blend.blends_near_first();
   arguments.wide_below = frame.config.blend.wide_below();
+  arguments.tail_alpha = frame.config.blend.tail_alpha();
   arguments.tail_reach = frame.config.blend.tail_reach();
   arguments.pairs = work.pairs;
   return arguments;

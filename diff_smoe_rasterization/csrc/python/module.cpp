@@ -26,6 +26,9 @@ py::dict constants() {
   out["alpha_cut"] = kAlphaCut;
   out["gate_cut"] = kGateCut;
   out["core_kernel"] = kCoreKernel;
+  out["core_alpha"] = kCoreAlpha;
+  out["tail_alpha"] = kTailAlpha;
+  out["every_tail_alpha"] = kEveryTailAlpha;
   out["transmittance_cut"] = kTransmittanceCut;
   out["gate_sum_cut"] = kGateSumCut;
   out["max_opacity"] = kMaxOpacity;

@@ -24,9 +24,11 @@ template <class S> struct BlendRules {
   DSMOE_HD S wide_below() const { return faint_below == S(kFaintBelowOfMode) ? S(faint_below_of(mode)) : faint_below; }
   // Whether a pixel is first blended with its near pairs only.
   DSMOE_HD bool blends_near_first() const { return near_first(mode) && wide_below() <= S(1); }
+  // The least alpha of a tail.
+  DSMOE_HD S tail_alpha() const { return S(blends_near_first() ? kTailAlpha : kEveryTailAlpha); }
   // What the tails reach beyond the strong pairs: is added to the squared reach of a footprint where tiles are listed.
   DSMOE_HD S tail_reach() const {
-    return has_tails(mode) ? S(2) * log(max(alpha_min, S(kStrongAlpha)) / S(kTailAlpha)) : S(0);
+    return has_tails(mode) ? S(2) * log(max(alpha_min, S(kStrongAlpha)) / tail_alpha()) : S(0);
   }
 
   // The same rules in another precision. Lambda is read: it must lie where the caller can read it.

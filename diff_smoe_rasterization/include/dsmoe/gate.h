@@ -62,18 +62,19 @@ template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
   return least_alpha > S(0) ? min(by_gate, by_alpha) : by_gate;
 }
 
-// A pair that counts is near where alpha >= 1/255, and everywhere within 3 sigma; else it is faint. A mode with
-// kNearFirst blends the faint pairs of a pixel only where its near pairs have a small gate sum.
+// A pair that counts is near where alpha >= 1/255, and within 3 sigma where alpha >= 1/1020; else it is faint. A mode
+// with kNearFirst blends the faint pairs of a pixel only where its near pairs have a small gate sum.
 //
 // The least alpha of a near pair. least_alpha: of a pair that counts.
 template <class S> DSMOE_HD S near_alpha(S opacity, S least_alpha) {
-  return max(least_alpha, min(S(kAlphaCut), opacity * S(kCoreKernel)));
+  return max(least_alpha, min(S(kAlphaCut), max(S(kCoreAlpha), opacity * S(kCoreKernel))));
 }
 
 // The squared reach of a Gaussian's near pairs. squared_reach: of all its pairs.
 template <class S> DSMOE_HD S near_reach(S opacity, S squared_reach) {
   if (!(opacity > S(0))) return squared_reach;
-  return min(squared_reach, max(S(2) * log(opacity / S(kAlphaCut)), S(-2 * kLn2 * kLog2CoreKernel)));
+  const S core = min(S(2) * log(opacity / S(kCoreAlpha)), S(-2 * kLn2 * kLog2CoreKernel));
+  return min(squared_reach, max(S(2) * log(opacity / S(kAlphaCut)), core));
 }
 
 template <class Real> struct Gate {
@@ -86,10 +87,10 @@ template <class Real> struct Gate {
 // One whose alpha is o G.
 template <class Real> struct UnclampedGate : Gate<Real> { static constexpr bool kClamps = false; };
 
-// The alpha of a pair that is a tail; 0 where it is strong, or too weak to be felt. counts: by Cut::kStrong.
-template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> inside) {
+// The alpha of a pair that is a tail; 0 where it is strong, or below tail_alpha (BlendRules). counts: by Cut::kStrong.
+template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> inside, Scalar<Real> tail_alpha) {
   using S = Scalar<Real>;
-  const Mask<Real> felt = inside & (gate.logit >= Real(S(kTailAlpha)));
+  const Mask<Real> felt = inside & (gate.logit >= Real(tail_alpha));
   return select(gate.counts, Real(S(0)), select(felt, gate.logit, Real(S(0))));
 }
 
@@ -127,7 +128,9 @@ template <class S> struct LogGate {
   template <class Real> DSMOE_HD ColumnExponent<Real, S> column(Real dx) const { return {factors, dx, greatest}; }
 
   // As near_alpha. It is the same number again where `least` is that of a near pair.
-  DSMOE_HD S near_least() const { return max(least, min(S(kLog2AlphaCut), greatest + S(kLog2CoreKernel))); }
+  DSMOE_HD S near_least() const {
+    return max(least, min(S(kLog2AlphaCut), max(S(kLog2CoreAlpha), greatest + S(kLog2CoreKernel))));
+  }
 
   // Where log_logit is above log2(o) the conic is no ellipse. Such a pair does not count. least: of a pair that counts.
   template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit, Real least) const {

@@ -55,7 +55,7 @@ struct GaussianRasterizationSettings {
   std::optional<BackgroundGate> background_gate;  // `smoe` and `smoe_eq7` only; absent: 0
   double low_pass = 0.3;                          // px^2 added to the variances on the image
   std::optional<double> faint_below;              // `smoe` and `smoe_eq7`: faint pairs and tails count where the gate
-                                                  // sum of near ones is below this; absent: 0.9 and 2, everywhere
+                                                  // sum of near ones is below this; absent: 0.25 and 2, everywhere
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.

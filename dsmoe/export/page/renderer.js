@@ -22,10 +22,11 @@ const float ALPHA_MAX = 0.99;
 const int ALPHA = 0, SMOE = 1, SMOE_EQ7 = 2;  // RULES: which pairs count
 const float ALPHA_CUT = 1.0 / 255.0;    // alpha: fainter pairs do not count
 const float STRONG_ALPHA = 1.0 / 2040.0;  // smoe: fainter pairs are tails
-const float TAIL_ALPHA = 2.9103830456733704e-11;  // smoe: 2^-35, below which tails do not count
-const float FAINT_BELOW = 0.9;          // smoe: where near pairs have a larger W no others count
+const float TAIL_ALPHA = 1.0 / 520200.0;  // smoe: fainter tails do not count
+const float FAINT_BELOW = 0.25;         // smoe: where near pairs have a larger W no others count
 const float KERNEL_CUT = 1e-5;          // smoe_eq7: smaller kernels do not count
-const float CORE_KERNEL = 0.011108996;  // G at 3 sigma, inside which no gate of the background cuts, and no pair is faint
+const float CORE_KERNEL = 0.011108996;  // G at 3 sigma, inside which no gate of the background cuts
+const float CORE_ALPHA = 1.0 / 1020.0;   // smoe: there, fainter pairs are faint
 const float GATE_SUM_CUT = 1e-30;       // below it no gate is open
 `;
 
@@ -115,7 +116,7 @@ void main() {
   if (antialiasing) opacity *= sqrt(max(COMPENSATION_FLOOR, unfiltered / determinant));
   leastAlpha = rule == ALPHA ? ALPHA_CUT : rule == SMOE ? STRONG_ALPHA :
                min(backgroundGate * ALPHA_CUT, opacity * CORE_KERNEL);
-  if (rule == SMOE && !wide) leastAlpha = max(leastAlpha, min(ALPHA_CUT, opacity * CORE_KERNEL));
+  if (rule == SMOE && !wide) leastAlpha = max(leastAlpha, min(ALPHA_CUT, max(CORE_ALPHA, opacity * CORE_KERNEL)));
   float faintest = wide ? TAIL_ALPHA : leastAlpha;
   float reach = faintest > 0.0 ? 2.0 * log(opacity / faintest) : 1e9;
   if (rule == SMOE_EQ7) reach = min(reach, -2.0 * log(KERNEL_CUT));
