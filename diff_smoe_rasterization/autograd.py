@@ -276,7 +276,7 @@ if _CAN_REGISTER:
                        ("project", _fake_project), ("project_backward", _fake_project_backward),
                        ("radii", _fake_radii), ("mark_visible", _fake_mark_visible),
                        ("contributions", _fake_contributions), ("importance", _fake_importance),
-                       ("gate_map", _fake_gate_map)):
+                       ("gate_map", _fake_gate_map), ("gate_adam", lambda *arguments: None)):
         torch.library.register_fake(_NAME + _op, _on_one_device(_op, _fake))
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
     torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)

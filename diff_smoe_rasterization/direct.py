@@ -6,13 +6,17 @@ from typing import Dict, List, Optional, Sequence
 import torch
 
 from .arguments import as_rendering, op_arguments
-from .autograd import IMAGES, INPUTS, refuse_transforms
+from .autograd import IMAGES, INPUTS, OPTIONS, refuse_transforms
 from .checks import check_tensors
+from .core import _core
 from .settings import FEATURE_OUTPUTS, GaussianRasterizationSettings, Rendering
 from .splats import Splats
 
 _OPS = torch.ops.diff_smoe_rasterization
 _COLORS, _BACKGROUND, _OPACITIES = INPUTS.index("colors_precomp"), INPUTS.index("bg"), INPUTS.index("opacities")
+_INSTANCES = [name for name, *_ in _core.saved["cuda"]].index("instances")
+_RADII = IMAGES.index("radii")
+_KIND = [list(OPTIONS).index(name) for name in ("image_width", "image_height", "blend_mode")]
 _ABSENT = [INPUTS.index(name) for name in ("means2D", "dc", "shs", "background_gate")]
 _GRADIENTS = {"color": "color", "alpha": "gate_sum", **{name: name for name in FEATURE_OUTPUTS}}
 
@@ -57,6 +61,28 @@ class DirectRendering:
     def splats(self) -> Splats:
         """What `rasterize_with_splats` returns beside the images, after `render`. Raises RuntimeError before it."""
         return Splats(self._rendered("splats"), self._saved, self._inputs, self._options)
+
+    @property
+    def room(self) -> int:
+        """On a GPU, after `render`: for how many tile instances there is room."""
+        return self._saved[_INSTANCES].numel()
+
+    def recent_instances(self) -> int:
+        """On a GPU: how many tile instances such renderings had at most lately, as far as it has counted; -1: unknown.
+
+        The host does not wait. A captured graph whose `room` is less is slow.
+        """
+        count = len(self._rendered("recent_instances")[_RADII])
+        return _core.recent_instances(*(self._options[index] for index in _KIND), count)
+
+    def forget_gaussians(self) -> None:
+        """Lets go of the arguments but for what `splats` takes; there is no `backward` any more.
+
+        For a caller that has captured the calls in a CUDA graph: the graph knows where the arguments lie, and they may
+        be replaced before the graph is.
+        """
+        self._inputs = [value if name in ("bg", "background_gate") else None
+                        for name, value in zip(INPUTS, self._inputs)]
 
     @torch.no_grad()
     def backward(self, dL_dimages: Dict[str, torch.Tensor], gradients: Dict[str, torch.Tensor]) -> None:

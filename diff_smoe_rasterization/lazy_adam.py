@@ -89,11 +89,6 @@ class LazyAdam:
     def _ages(self) -> List[int]:
         return [int(self.adam.state.get(parameter, {}).get("step", 0)) for parameter in self.parameters]
 
-    def _leave(self) -> None:
-        """Notes how everything is, for `_is_as_left`."""
-        self._left = [(tensor, tensor._version) for tensor in self._tensors() if tensor is not None]
-        self._left_ages = self._ages()
-
     def _is_as_left(self) -> bool:
         return self._ages() == self._left_ages and all(
             left._version == version and tensor is left for tensor, (left, version) in zip(self._tensors(), self._left))
@@ -106,11 +101,8 @@ class LazyAdam:
         if self._steps == 0:
             return
         self._look_up()
-        group = self._groups[0]
-        _OPS.lazy_adam_catch_up(self.parameters, [state["exp_avg"] for state in self._states],
-                                [state["exp_avg_sq"] for state in self._states], self.gradients, self._marks,
-                                self._rates, self._steps, *group["betas"], group["eps"], radii)
-        self._leave()
+        self._launch_catch_up(radii, None)
+        self.end()
         if radii is None:
             self._marks.zero_()
             self._steps = 0
@@ -119,13 +111,67 @@ class LazyAdam:
     def step(self, radii: torch.Tensor) -> None:
         """Makes a step. Rows where radii [N] (int32) is above 0 are up to date, and `gradients` has theirs."""
         check_tensors("LazyAdam.step", radii=radii)
+        age, rates = self._next_step()
+        _OPS.lazy_adam_step(self._marks, self._rates, self._steps, *map(list, zip(*rates)), radii)
+        self._count_step(age)  # behind the op: where it refuses radii no step is counted
+        self.end()
+
+    # The same in two parts: the host's, and the launches', which read their numbers in memory of the device. So a loop
+    # may capture the launches in a CUDA graph, and make the host's part at each replay.
+
+    def begin_catch_up(self) -> int:
+        """The host's part of `catch_up(radii)`; returns the number that `launch_catch_up` reads."""
+        self._make_room()
+        if self._steps > 0:
+            self._look_up()
+        return self._steps
+
+    @torch.no_grad()
+    def launch_catch_up(self, radii: torch.Tensor, steps: torch.Tensor) -> None:
+        """The launch of `catch_up(radii)`. steps: [1] of the parameters' type, what `begin_catch_up` returned."""
+        self._launch_catch_up(radii, steps)
+
+    def next_rates(self) -> List[float]:
+        """The rates that `begin_step` will return, as the learning rates are now."""
+        age = int(self._states[0]["step"]) + 1
+        return [number for group in self._groups for number in corrected_rates(group, age)]
+
+    def begin_step(self) -> Tuple[int, List[float]]:
+        """The host's part of `step`; returns the numbers that `launch_step` reads: steps, and the rates row by row."""
+        age, rates = self._next_step()
+        steps = self._steps
+        self._count_step(age)
+        return steps, [number for rate in rates for number in rate]
+
+    @torch.no_grad()
+    def launch_step(self, radii: torch.Tensor, steps: torch.Tensor, rates: torch.Tensor) -> None:
+        """The launch of `step(radii)`. steps: [1], rates: [parameters, 2], what `begin_step` returned."""
+        zeros = [0.0] * len(self.parameters)
+        _OPS.lazy_adam_step(self._marks, self._rates, 0, zeros, zeros, radii, steps, rates)
+
+    def end(self) -> None:
+        """Notes that what has changed up to here was the caller's launches; after both of them, captured or not."""
+        self._left = [(tensor, tensor._version) for tensor in self._tensors() if tensor is not None]
+        self._left_ages = self._ages()
+
+    def _launch_catch_up(self, radii: Optional[torch.Tensor], given_steps: Optional[torch.Tensor]) -> None:
+        group = self._groups[0]
+        _OPS.lazy_adam_catch_up(self.parameters, [state["exp_avg"] for state in self._states],
+                                [state["exp_avg_sq"] for state in self._states], self.gradients, self._marks,
+                                self._rates, self._steps, *group["betas"], group["eps"], radii, given_steps)
+
+    def _make_room(self) -> None:
         if self._steps == len(self._rates):
             self.catch_up()
+
+    def _next_step(self) -> Tuple[int, List[Tuple[float, float]]]:
+        """How old the parameters are after the next step, and its rates."""
+        self._make_room()
         self._look_up()
         age = int(self._states[0]["step"]) + 1
-        rates, root_scales = zip(*(corrected_rates(group, age) for group in self._groups))
-        _OPS.lazy_adam_step(self._marks, self._rates, self._steps, rates, root_scales, radii)
-        for state in self._states:  # behind the op: where it refuses radii no step is counted
+        return age, [corrected_rates(group, age) for group in self._groups]
+
+    def _count_step(self, age: int) -> None:
+        for state in self._states:
             state["step"] = age
         self._steps += 1
-        self._leave()

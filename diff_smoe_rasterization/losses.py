@@ -8,7 +8,6 @@ import torch
 from .autograd import once_differentiable, refuse_transforms
 from .checks import check_tensors, checked_number
 from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
-from .images import as_float
 
 _OPS = torch.ops.diff_smoe_rasterization
 _WINDOW_RADIUS = 5  # pixels; of the 11x11 window
@@ -25,7 +24,7 @@ def l1_ssim_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float 
     check_tensors("l1_ssim_loss", image=image, target=target)
     lambda_dssim = checked_number("l1_ssim_loss", "lambda_dssim", lambda_dssim)
     _refuse_gradient("l1_ssim_loss", "target", target)
-    return _image_loss(image, target, 1 - lambda_dssim, -lambda_dssim, lambda_dssim, 0)
+    return _image_loss(image, target, 1 - lambda_dssim, 0.0, -lambda_dssim, lambda_dssim, 0)
 
 
 def l1_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor,
@@ -33,7 +32,7 @@ def l1_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor,
     """`l1_ssim_loss` and its gradient by the image, without autograd."""
     check_tensors("l1_ssim_loss_and_gradient", image=image, target=target)
     lambda_dssim = checked_number("l1_ssim_loss_and_gradient", "lambda_dssim", lambda_dssim)
-    return _OPS.image_loss(image.detach(), target, 1 - lambda_dssim, -lambda_dssim, lambda_dssim, 0, True)
+    return _OPS.image_loss(image.detach(), target, 1 - lambda_dssim, 0.0, -lambda_dssim, lambda_dssim, 0, True)
 
 
 def l2_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float,
@@ -42,12 +41,8 @@ def l2_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor, lambda_
     check_tensors("l2_ssim_loss_and_gradient", image=image, target=target)
     lambda_dssim = checked_number("l2_ssim_loss_and_gradient", "lambda_dssim", lambda_dssim)
     weight = checked_number("l2_ssim_loss_and_gradient", "weight", weight)
-    image = image.detach()
-    loss, gradient = _OPS.image_loss(image, target, 0.0, -lambda_dssim, lambda_dssim, 0, True)
-    difference = image - as_float(target, image.dtype)
-    weight *= 1 - lambda_dssim
-    return (loss + weight * difference.square().mean(),
-            gradient.add_(difference, alpha=2 * weight / difference.numel()))
+    return _OPS.image_loss(image.detach(), target, 0.0, weight * (1 - lambda_dssim), -lambda_dssim, lambda_dssim, 0,
+                           True)
 
 
 def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", train: bool = True) -> torch.Tensor:
@@ -62,7 +57,7 @@ def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", tr
     if not isinstance(padding, str) or padding not in _MARGINS:
         raise ValueError(f"fused_ssim: padding is {padding!r}; it must be one of {', '.join(_MARGINS)}")
     _refuse_gradient("fused_ssim", "img2", img2)
-    return _image_loss(img1 if train else img1.detach(), img2, 0.0, 1.0, 0.0, _MARGINS[padding])
+    return _image_loss(img1 if train else img1.detach(), img2, 0.0, 0.0, 1.0, 0.0, _MARGINS[padding])
 
 
 def _refuse_gradient(function: str, name: str, tensor: torch.Tensor) -> None:
@@ -90,4 +85,4 @@ class _ImageLoss(torch.autograd.Function):
     @once_differentiable("SSIM and the image loss")
     def backward(ctx: Any, dL_dloss: torch.Tensor) -> Tuple[Any, ...]:  # type: ignore[override]
         _, gradient = ctx.saved_tensors
-        return (gradient * dL_dloss,) + (None,) * 5
+        return (gradient * dL_dloss,) + (None,) * 6

@@ -71,7 +71,7 @@ template <class S> void refuse_note_step(const char* function, const LazyAdamSte
   refuse_num_tensors(function, step.num_tensors);
   refuse_null(function, "marks", step.marks, "[N]", step.num_rows);
   refuse_null(function, "radii", step.radii, "[N]", step.num_rows);
-  refuse_null(function, "rates", step.rates, "[num_tensors]", step.num_tensors);
+  refuse_null(function, "rates", step.rates, "[steps + 1, num_tensors]", step.num_tensors);
 }
 
 template <class S>

@@ -2,11 +2,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, NamedTuple, Optional, Tuple
+from typing import Any, Dict, NamedTuple, Optional
 
-import torch
-
-from diff_smoe_rasterization.losses import l2_ssim_loss_and_gradient
 from diff_smoe_rasterization.settings import resolve_background_gate
 
 from ..config import TrainConfig
@@ -39,12 +36,10 @@ class FixedGaussians(Strategy):
     def __init__(self, context: StrategyContext, squares: float = 0.0) -> None:
         """squares: the weight of the squared error in place of L1, as at the end of `importance`; 0: L1."""
         super().__init__(context)
-        self.squares = squares
+        self._squares = squares
 
-    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-        if self.squares == 0:
-            return super().loss(iteration, image, target)
-        return l2_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim, self.squares)
+    def squares(self, iteration: int) -> float:
+        return self._squares
 
 
 class RisingGate(FixedGaussians):

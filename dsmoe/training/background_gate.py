@@ -20,8 +20,7 @@ _OPS = torch.ops.diff_smoe_rasterization
 class LearnedGate:
     """lambda = bound + exp(p): p is stepped by Adam; with the bound 0 too, lambda stays positive and finite.
 
-    A step has no autograd here, few kernels, and Adam's op without the optimizer around it, which would nearly double
-    the host's time for the gate: where Gaussians are few, the host's time is the training's.
+    A step is one kernel, without autograd and without an optimizer.
     """
 
     def __init__(self, config: TrainConfig, device: str) -> None:
@@ -30,9 +29,8 @@ class LearnedGate:
         self.logarithm = torch.full((1,), math.log(config.background_gate_start - self.bound), device=device)
         self._group = {"lr": config.background_gate_lr * math.sqrt(config.batch), "betas": batch_betas(config.batch)}
         self._adam: Dict[str, Any] = {}
-        self._excess = self.logarithm.exp()  # of lambda over its bound
-        # [1], always this tensor, so that renderers may hold it.
-        self.value = self._excess + self.bound if self.bound else self._excess
+        self.value = torch.zeros_like(self.logarithm)  # [1], always this tensor, so that renderers may hold it
+        self._evaluate()
         self.gradient = torch.zeros_like(self.value)  # [1] by lambda; passes write into this tensor
 
     @torch.no_grad()
@@ -42,16 +40,17 @@ class LearnedGate:
         if not adam:
             adam.update(step=0, exp_avg=torch.zeros_like(self.value), exp_avg_sq=torch.zeros_like(self.value))
         adam["step"] = int(adam["step"]) + 1
-        rate, root_scale = corrected_rates(self._group, adam["step"])
-        _OPS.adam([self.logarithm], [self.gradient * self._excess], [adam["exp_avg"]], [adam["exp_avg_sq"]], [rate],
-                  [root_scale], *self._group["betas"], EPSILON, None)
-        self.logarithm.clamp_(-LIMIT, LIMIT)
-        self._evaluate()
+        self._launch(adam["exp_avg"], adam["exp_avg_sq"], self.gradient, *corrected_rates(self._group, adam["step"]))
 
     def _evaluate(self) -> None:
-        torch.exp(self.logarithm, out=self._excess)
-        if self.bound:
-            torch.add(self._excess, self.bound, out=self.value)
+        """Sets the value by a step of nothing: so it has the bits that a step gives it."""
+        moment, square, gradient = self.logarithm.new_zeros(3, 1)
+        self._launch(moment, square, gradient, 0.0, 1.0)
+
+    def _launch(self, moment: torch.Tensor, square: torch.Tensor, gradient: torch.Tensor, rate: float,
+                root_scale: float) -> None:
+        _OPS.gate_adam(self.logarithm, moment, square, self.value, gradient, rate, root_scale, *self._group["betas"],
+                       EPSILON, self.bound, LIMIT)
 
     def state_dict(self) -> Dict[str, Any]:
         """Tensors and plain values of a checkpoint."""

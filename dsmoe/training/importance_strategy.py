@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from diff_smoe_rasterization.images import as_float
-from diff_smoe_rasterization.losses import l2_ssim_loss_and_gradient
 from diff_smoe_rasterization.splats import Splats
 
 from ..errors import ConfigError
@@ -110,18 +109,18 @@ class ImportanceStrategy(SteadyStrategy):
         """[N] which Gaussians few views need; of fewer views that a decision looks at, as small a part."""
         return self.needed * len(self.context.views) < self.options.needs * self.looks
 
-    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-        if iteration <= self.moves_end or self.options.squares == 0:
-            return super().loss(iteration, image, target)
-        return l2_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim, self.options.squares)
+    def squares(self, iteration: int) -> float:
+        return self.options.squares if iteration > self.moves_end else 0.0
+
+    def before_render(self, iteration: int) -> None:
+        if self.options.anneal != 1:
+            span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
+            share = min(max((iteration - self.moves_end) / span, 0.0), 1.0)
+            self.context.optimizer.scale_other_rates(self.options.anneal**share)
 
     def before_backward(self, step: ViewStep) -> None:
         if self._looks(step):
             self._look(step.view, step.target, step.rendering.color, step.splats())
-        if self.options.anneal != 1:
-            span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
-            share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
-            self.context.optimizer.scale_other_rates(self.options.anneal**share)
 
     def after_step(self, step: ViewStep) -> None:
         if step.iteration in self.removals:

@@ -1,21 +1,22 @@
 """How a step comes from its views to gradients and to the next parameters, in three kinds with the same numbers.
 
 `AutogradPasses` takes any rasterizer. `DirectPasses` is for a GPU, where a step is bound by memory traffic and by
-Python: it steps spherical harmonics lazily, makes one pass of activations and Adam, and writes no gradient of what was
-not seen. `BatchPasses`, in distributed/passes.py, take several views and several processes.
+Python: it steps spherical harmonics lazily, makes one pass of activations and Adam, writes no gradient of what was not
+seen, and repeats steps as CUDA graphs. `BatchPasses`, in distributed/passes.py, take several views and processes.
 """
 from __future__ import annotations
 
 import weakref
-from typing import Callable, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import torch
 
 from diff_smoe_rasterization.direct import DirectRendering
 from diff_smoe_rasterization.extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 from diff_smoe_rasterization.gaussians import activate
+from diff_smoe_rasterization.lazy_adam import LazyAdam
 from diff_smoe_rasterization.optimizers import corrected_rates
-from diff_smoe_rasterization.settings import Rendering
+from diff_smoe_rasterization.settings import GaussianRasterizationSettings, Rendering
 from diff_smoe_rasterization.splats import Splats
 
 from ..model import PARAMETERS, GaussianModel
@@ -24,6 +25,7 @@ from ..results.rendering import Renderer, package_rasterizer
 from ..scenes.cameras import Camera
 from ..scenes.images import View
 from .background_gate import LearnedGate
+from .graphs import Captured, Graphs, NoGraphs
 from .strategy import Step, ViewStep
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -63,8 +65,10 @@ class Passes:
         raise NotImplementedError
 
 
-class _OneView(Passes):
-    """What the two kinds for one view share."""
+class AutogradPasses(Passes):
+    """The passes as torch knows them."""
+
+    _seen: Optional[Callable[[], Splats]] = None
 
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> ViewStep:
         (shown,) = views
@@ -74,38 +78,18 @@ class _OneView(Passes):
 
     def backward(self, step: Step) -> None:
         assert isinstance(step, ViewStep)
-        self._differentiate(self._dL_dcolor)
+        self._seen = None  # which holds on to memory, as what is deleted below
+        self._color.backward(self._dL_dcolor)
         gradient = self._means2D.grad
         assert gradient is not None
         step.seen.append((gradient, step.rendering.radii))
-        del self._means2D, self._dL_dcolor  # they hold on to memory
+        del self._means2D, self._dL_dcolor, self._color
 
     def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
-        """The image, and a tensor [N, 3] whose .grad `_differentiate` sets where radii > 0.
+        """The image, and a tensor [N, 3] whose .grad `backward` sets where radii > 0.
 
         background: in place of the renderer's.
         """
-        raise NotImplementedError
-
-    def _splats(self) -> Splats:
-        """What the image of `_draw` says of each Gaussian."""
-        raise NotImplementedError
-
-    def _differentiate(self, dL_dcolor: torch.Tensor) -> None:
-        """From the gradient by the image [3, H, W] to those by all parameters and the gate."""
-        raise NotImplementedError
-
-    def _add_gradient(self, name: str, number: float) -> None:
-        """Adds a number to the gradient by every opacity, scale or rotation (the parameter's name); after backward."""
-        raise NotImplementedError
-
-
-class AutogradPasses(_OneView):
-    """The passes as torch knows them."""
-
-    _seen: Optional[Callable[[], Splats]] = None
-
-    def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
         means2D = torch.zeros_like(self.model.raw["means3D"], requires_grad=True)
         gate = None
         if self.gate:
@@ -122,15 +106,13 @@ class AutogradPasses(_OneView):
         return rendering, means2D
 
     def _splats(self) -> Splats:
+        """What the image of `_draw` says of each Gaussian."""
         assert self._seen is not None, "render comes first"
         return self._seen()
 
-    def _differentiate(self, dL_dcolor: torch.Tensor) -> None:
-        self._seen = None  # which holds on to memory
-        self._color.backward(dL_dcolor)
-
     @torch.enable_grad()
     def _add_gradient(self, name: str, number: float) -> None:
+        """Adds a number to the gradient by every opacity, scale or rotation (the parameter's name); after backward."""
         value = self.model.activated()[ACTIVATED.index(name)]
         value.backward(torch.full_like(value, number))
 
@@ -138,51 +120,133 @@ class AutogradPasses(_OneView):
         self.optimizer.step()
 
 
-class DirectPasses(_OneView):
-    """The same numbers in fewer passes over memory."""
+class _Drawn(NamedTuple):
+    """What `DirectPasses` draw of a view."""
+
+    direct: DirectRendering
+    rendering: Rendering
+    target: torch.Tensor
+    loss: torch.Tensor
+    dL_dcolor: torch.Tensor
+
+
+class DirectPasses(Passes):
+    """The same numbers in fewer passes over memory; as CUDA graphs where steps are alike.
+
+    A step has three parts, whose launches read all that changes from step to step in memory of the device: `_numbers`
+    and, in a graph, copies of the view. So hooks run between the parts, whether these are launched or replayed.
+    """
 
     def __init__(self, model: GaussianModel, optimizer: GaussianOptimizer, renderer: Renderer,
-                 gate: Optional[LearnedGate] = None) -> None:
+                 gate: Optional[LearnedGate] = None, loss_rule: Callable[[int], Any] = lambda iteration: iteration,
+                 graphs: Optional[Graphs] = None) -> None:
+        """loss_rule: `Strategy.loss_rule`. graphs: where steps are captured; None: they are not."""
         super().__init__(model, optimizer, renderer, gate)
+        self._loss_rule, self._graphs = loss_rule, graphs or NoGraphs()
         self._values: List[torch.Tensor] = []  # what `activate` makes of the parameters
         self._made_of: List[Tuple[torch.Tensor, int]] = []  # these, and their versions at that time
         self._buffers: Dict[str, torch.Tensor] = {}  # gradients
-
-    def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
-        model = self.model
-        lazy = self.optimizer.lazy_colors()
-        parameters = model.stored
-        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
-        self._rendered = {name: weakref.ref(tensor) for name, tensor in parameters.items()}
-        settings = self.renderer.settings_of(camera, background)
-        means2D = self._buffer("means2D", parameters["means3D"]).requires_grad_()
-        means2D.grad = None
-        self._activate()
-        colors = {argument: parameters[name] for argument, name in model.color_sources().items()}
-        self._direct: Optional[DirectRendering] = DirectRendering(
-            parameters["means3D"], self._values[0], settings, means2D=means2D, scales=self._values[1],
-            rotations=self._values[2], **colors)
-        lazy.catch_up(self._direct.visible_radii())
-        rendering = self._direct.render()
-        self._radii = self._stepped = rendering.radii
-        return rendering, means2D
-
-    def _splats(self) -> Splats:
-        assert self._direct is not None, "render comes first"
-        return self._direct.splats()
+        # How many steps harmonics may have missed, then the rates of geometry and of harmonics, as the ops take them.
+        self._numbers = model.stored["means3D"].new_zeros(1 + 2 * len(PARAMETERS))
 
     @torch.no_grad()
-    def _differentiate(self, dL_dcolor: torch.Tensor) -> None:
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> ViewStep:
+        (shown,) = views
+        stored, lazy = self.model.stored, self.optimizer.lazy_colors()
+        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
+        self._rendered = {name: weakref.ref(tensor) for name, tensor in stored.items()}
+        self._activate()
+        steps = lazy.begin_catch_up()
+        settings = self.renderer.settings_of(shown.view.camera, shown.background)
+        kind = self._graphs.kind(settings, self._loss_rule(iteration), *shown)
+        self._captured: Optional[Captured] = None  # of the step before: it may hold on to memory
+        self._captured = self._graphs.find(
+            [*stored.values(), lazy], kind, lambda captured: self._capture(captured, settings, shown, compare))
+        self._sent = [float(steps), *self._rates(1), *lazy.next_rates()]
+        numbers = self._numbers[:len(self._sent)]
+        if self._captured:
+            self._drawn: _Drawn = self._captured.replay_draw(numbers, self._sent, settings, *shown)
+        else:
+            _OPS.set_inputs([], [], numbers, self._sent)
+            self._drawn = self._draw(settings, shown, compare)
+        lazy.end()
+        drawn = self._drawn
+        self._radii = self._stepped = drawn.rendering.radii
+        return ViewStep(iteration, 1, drawn.loss, shown.view, drawn.target, drawn.rendering, drawn.direct.splats,
+                        self._add_gradient)
+
+    @torch.no_grad()
+    def backward(self, step: Step) -> None:
+        stored = self.model.stored
+        self._gradients = {name: self._buffer("d" + name, stored[name]) for name in GEOMETRY}
+        if self._captured:
+            self._captured.replay_differentiate()
+        else:
+            self._differentiate(self._drawn)
+        step.seen.append((self._buffer("dmeans2D", stored["means3D"]), self._radii))
+        del self._drawn  # which holds on to memory
+
+    @torch.no_grad()
+    def update(self) -> None:
+        stored, lazy = self.model.stored, self.model.lazy
+        same = {name for name in PARAMETERS if stored[name] is self._rendered[name]()}
+        geometry = same.issuperset(GEOMETRY)
+        colors = lazy is not None and same.issuperset(self.model.color_sources().values())
+        if not geometry and same.intersection(GEOMETRY):
+            self._step_some(same)
+        numbers = list(self._sent)
+        if geometry:
+            self._count_step()
+            numbers[1:1 + 2 * len(GEOMETRY)] = self._rates(0)
+        if colors and lazy is not None:
+            numbers[0], numbers[1 + 2 * len(GEOMETRY):] = lazy.begin_step()
+        if numbers != self._sent:  # a hook has changed learning rates, or read the model
+            _OPS.set_inputs([], [], self._numbers[:len(numbers)], numbers)
+        if self._captured and geometry and colors and self._stepped is self._radii:
+            self._captured.replay_update()
+        else:
+            if geometry:
+                self._step_geometry(self._stepped)
+            if colors and lazy is not None:
+                self._step_colors(lazy, self._radii)
+        if colors and lazy is not None:
+            lazy.end()
+
+    def _capture(self, captured: Captured, settings: GaussianRasterizationSettings, shown: ViewOver,
+                 compare: Compare) -> None:
+        """Captures the parts of a step like this one; nothing is computed."""
+        lazy = self.model.lazy
+        assert lazy is not None
+        settings, view, background = captured.copies(settings, *shown)
+
+        def update() -> None:
+            radii = captured.drawn.rendering.radii
+            self._step_geometry(radii)
+            self._step_colors(lazy, radii)
+
+        captured.capture(lambda: self._draw(settings, ViewOver(view, background), compare), self._differentiate, update)
+
+    def _draw(self, settings: GaussianRasterizationSettings, shown: ViewOver, compare: Compare) -> _Drawn:
         parameters, lazy = self.model.stored, self.model.lazy
-        assert self._direct is not None and lazy is not None, "render comes first"
-        self._gradients = {name: self._buffer("d" + name, parameters[name]) for name in GEOMETRY}
-        gradients = {**self._gradients, **dict(zip(self.model.color_sources(), lazy.gradients)),
-                     "means2D": self._buffer("dmeans2D", parameters["means3D"])}
+        assert lazy is not None
+        colors = {argument: parameters[name] for argument, name in self.model.color_sources().items()}
+        direct = DirectRendering(
+            parameters["means3D"], self._values[0], settings, means2D=self._buffer("means2D", parameters["means3D"]),
+            scales=self._values[1], rotations=self._values[2], **colors)
+        lazy.launch_catch_up(direct.visible_radii(), self._numbers[:1])
+        rendering = direct.render()
+        return _Drawn(direct, rendering, *compare(shown, rendering.color))
+
+    def _differentiate(self, drawn: _Drawn) -> None:
+        """From the gradient by the image to those by all parameters and the gate."""
+        stored, lazy = self.model.stored, self.model.lazy
+        assert lazy is not None
+        gradients = {name: self._buffer("d" + name, stored[name]) for name in GEOMETRY}
+        gradients.update(zip(self.model.color_sources(), lazy.gradients))
+        gradients["means2D"] = self._buffer("dmeans2D", stored["means3D"])
         if self.gate:
             gradients["background_gate"] = self.gate.gradient
-        self._direct.backward({"color": dL_dcolor}, gradients)
-        self._direct = None  # which holds on to memory
-        self._means2D.grad = gradients["means2D"]
+        drawn.direct.backward({"color": drawn.dL_dcolor}, gradients)
 
     def _add_gradient(self, name: str, number: float) -> None:
         if self._stepped is self._radii:  # rows that were not seen hold anything
@@ -191,31 +255,40 @@ class DirectPasses(_OneView):
             self._stepped = torch.ones_like(self._radii)
         self._gradients[name] += number
 
-    @torch.no_grad()
-    def update(self) -> None:
-        stored, lazy = self.model.stored, self.model.lazy
-        same = {name for name in PARAMETERS if stored[name] is self._rendered[name]()}
-        if same.issuperset(GEOMETRY):
-            self._step_geometry()
-        elif same.intersection(GEOMETRY):
-            self._step_some(same)
-        if lazy is not None and same.issuperset(self.model.color_sources().values()):
-            lazy.step(self._radii)
-
-    def _step_geometry(self) -> None:
-        raw = [self.model.stored[name] for name in GEOMETRY]
-        states, rates = [], []
-        for name, tensor in zip(GEOMETRY, raw):
-            state, group = self.optimizer.adam.state[tensor], self.optimizer.group(name)
+    def _states(self) -> List[Dict[str, Any]]:
+        """Adam's, of the geometry."""
+        states = []
+        for name in GEOMETRY:
+            tensor = self.model.stored[name]
+            state = self.optimizer.adam.state[tensor]
             if not state:
                 state.update(step=0, exp_avg=torch.zeros_like(tensor), exp_avg_sq=torch.zeros_like(tensor))
-            state["step"] = int(state["step"]) + 1
-            rates.append(corrected_rates(group, state["step"]))
             states.append(state)
-        _OPS.gaussian_adam(raw, self._values, [self._gradients[name] for name in GEOMETRY],
+        return states
+
+    def _count_step(self) -> None:
+        for state in self._states():
+            state["step"] = int(state["step"]) + 1
+
+    def _rates(self, ahead: int) -> List[float]:
+        """Of the geometry's latest step, or of one ahead of it; row by row, as `gaussian_adam` takes them."""
+        return [number for name, state in zip(GEOMETRY, self._states())
+                for number in corrected_rates(self.optimizer.group(name), int(state["step"]) + ahead)]
+
+    def _step_geometry(self, seen: torch.Tensor) -> None:
+        """By the rates in `_numbers`. seen: [N] int32 above 0 where there is a gradient."""
+        raw, states = [self.model.stored[name] for name in GEOMETRY], self._states()
+        group, zeros = self.optimizer.group("scales"), [0.0] * len(raw)
+        _OPS.gaussian_adam(raw, self._values, [self._buffer("d" + name, self.model.stored[name]) for name in GEOMETRY],
                            [state["exp_avg"] for state in states], [state["exp_avg_sq"] for state in states],
-                           self._stepped, *map(list, zip(*rates)), *group["betas"], group["eps"])
+                           seen, zeros, zeros, *group["betas"], group["eps"],
+                           self._numbers[1:1 + 2 * len(raw)].view(-1, 2))
         self._made_of = [(tensor, tensor._version) for tensor in raw[1:]]
+
+    def _step_colors(self, lazy: LazyAdam, radii: torch.Tensor) -> None:
+        first = 1 + 2 * len(GEOMETRY)
+        rates = self._numbers[first:first + 2 * len(lazy.parameters)].view(-1, 2)
+        lazy.launch_step(radii, self._numbers[:1], rates)
 
     def _step_some(self, same: Set[str]) -> None:
         """Where an opacity reset has replaced a parameter: the others are stepped by the dense optimizer."""
@@ -233,8 +306,12 @@ class DirectPasses(_OneView):
         raw = [self.model.stored[name] for name in ACTIVATED]
         if len(self._made_of) != len(raw) or any(tensor is not made_of or tensor._version != version
                                                  for tensor, (made_of, version) in zip(raw, self._made_of)):
-            with torch.no_grad():
-                self._values = list(activate(*raw))
+            values = list(activate(*raw))
+            if [value.shape for value in values] == [value.shape for value in self._values]:
+                for value, new in zip(self._values, values):  # graphs know where they lie
+                    value.copy_(new)
+            else:
+                self._values = values
             self._made_of = [(tensor, tensor._version) for tensor in raw]
 
     def _buffer(self, name: str, like: torch.Tensor) -> torch.Tensor:

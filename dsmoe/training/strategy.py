@@ -11,7 +11,7 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 import torch
 
 from diff_smoe_rasterization.gaussians import add_view
-from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient
+from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient, l2_ssim_loss_and_gradient
 from diff_smoe_rasterization.settings import Rendering
 from diff_smoe_rasterization.splats import Splats
 
@@ -88,8 +88,9 @@ class ViewStep(Step):
 class Strategy:
     """Does nothing: a fixed set of Gaussians. The base of every strategy.
 
-    Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer), which
-    the last iteration of a run leaves out. A strategy that is not among config.BATCHED gets each step as a ViewStep.
+    Hooks run in this order in each step. Learning rates may be set in any, best in the first; rows may be added or
+    removed in the last two (through the optimizer), which the last iteration of a run leaves out. A strategy that is
+    not among config.BATCHED gets each step as a ViewStep. The tensors of a step hold until the next one.
     """
 
     def __init__(self, context: StrategyContext) -> None:
@@ -98,7 +99,24 @@ class Strategy:
 
     def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         """The loss of a rendering [3, H, W], and its gradient by it. target: floats, or bytes of 255ths."""
-        return l1_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim)
+        squares, lambda_dssim = self.squares(iteration), self.context.config.lambda_dssim
+        if squares == 0:
+            return l1_ssim_loss_and_gradient(image, target, lambda_dssim)
+        return l2_ssim_loss_and_gradient(image, target, lambda_dssim, squares)
+
+    def squares(self, iteration: int) -> float:
+        """The weight of the squared error in the loss, in place of the absolute one; 0: the loss of 3DGS."""
+        return 0.0
+
+    def loss_rule(self, iteration: int) -> Any:
+        """What `loss` depends on beside the images: a step may be repeated as a CUDA graph while this stays equal.
+
+        A `loss` of a strategy's own is called anew in each step, unless the strategy says here what it depends on.
+        """
+        return self.squares(iteration) if type(self).loss is Strategy.loss else iteration
+
+    def before_render(self, iteration: int) -> None:
+        """A step begins that ends with this iteration."""
 
     def before_backward(self, step: Step) -> None:
         """The loss is known, its gradients are not."""

@@ -19,13 +19,14 @@ from ..scenes.scene import Scene, difference_of, scene_fingerprint
 from ..system.group import ALONE
 from ..system.stopwatch import Stopwatch
 from .background_gate import LearnedGate
+from .graphs import CudaGraphs
 from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses, Passes, ViewOver
 from .randomness import random_state, restore_random_state, seed_everything
 from .shards import Shards
 from .state_check import check_state
 from .strategies import STRATEGIES
-from .strategy import Step, StrategyContext, is_due
+from .strategy import Step, StrategyContext, ViewStep, is_due
 
 
 class Trainer:
@@ -62,8 +63,11 @@ class Trainer:
 
     def _make_passes(self, rasterize: Optional[Rasterize]) -> Passes:
         """How a step comes from its views to the next parameters."""
-        direct = self.config.device != "cpu" and rasterize is None
-        return (DirectPasses if direct else AutogradPasses)(self.model, self.optimizer, self.renderer, self.gate)
+        parts = (self.model, self.optimizer, self.renderer, self.gate)
+        if self.config.device == "cpu" or rasterize is not None:
+            return AutogradPasses(*parts)
+        return DirectPasses(*parts, loss_rule=lambda iteration: self.strategy.loss_rule(iteration),
+                            graphs=CudaGraphs(self.model.stored["means3D"].device))
 
     @property
     def leads(self) -> bool:
@@ -119,7 +123,10 @@ class Trainer:
         self.optimizer.set_position_rate(self.iteration)
         if is_due(self.iteration, config.sh_degree_interval, config.batch):
             self.model.raise_sh_degree()
+        self.strategy.before_render(self.iteration)
         step = self.passes.render(self.iteration, self._next_views(), self._compare)
+        if isinstance(step, ViewStep):  # a repeated step does not call `_compare`
+            self._report = (step.rendering.color.detach(), step.target, step.view)
         self.strategy.before_backward(step)
         self.passes.backward(step)
         if before_change:

@@ -76,11 +76,11 @@ TEST(RefuseTraining, LazyAdam) {
                    {[](auto& a) { a.tensors[0].square = nullptr; }, null("tensors[0].square", "of 3 numbers")},
                    {[](auto& a) { a.num_tensors = 5; }, "num_tensors is 5; it must be 0 to 4"},
                    {[](auto& a) { a.num_tensors = -1; }, "num_tensors is -1; it must be 0 to 4"}});
-  const LazyAdamStep<float> step = {1, marks, radii, rates, {}, 1, 0};
+  const LazyAdamStep<float> step = {1, marks, radii, rates, {}, 1, 0, nullptr, nullptr};
   expect_refusals("cpu::note_step", step, [](const auto& s) { cpu::note_step(s); },
                   {{[](auto& s) { s.marks = nullptr; }, null("marks", "[N]")},
                    {[](auto& s) { s.radii = nullptr; }, null("radii", "[N]")},
-                   {[](auto& s) { s.rates = nullptr; }, null("rates", "[num_tensors]")}});
+                   {[](auto& s) { s.rates = nullptr; }, null("rates", "[steps + 1, num_tensors]")}});
 }
 
 TEST(RefuseTraining, GatherAndNeighbours) {
@@ -102,7 +102,7 @@ TEST(RefuseTraining, GatherAndNeighbours) {
 
 TEST(RefuseTraining, ImageLoss) {
   float gradient[12], derivatives[36], value[1];
-  const ImageLoss<float> good = {numbers, numbers, nullptr, 1, 3, 4, 0, 1, 0, 0, value, gradient, derivatives, sums};
+  const ImageLoss<float> good = {numbers, numbers, nullptr, 1, 3, 4, 0, 1, 0, 0, 0, value, gradient, derivatives, sums};
   expect_refusals("cpu::image_loss", good, [](const auto& loss) { cpu::image_loss(loss, 1); },
                   {{[](auto& l) { l.image = nullptr; }, null("image", "[planes, height, width]")},
                    {[](auto& l) { l.target = nullptr; },

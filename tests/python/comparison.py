@@ -105,7 +105,7 @@ def threshold_margin(scene):
             alpha = reference.pair_alphas(splats, x, y, counts)
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
         if leaves_out_faint(mode, settings.faint_below):
-            # A pair is near by its alpha, or by its kernel and a lower alpha. Such pairs have an early stop of their own.
+            # A pair is near by its alpha, or by its kernel and a lower alpha. Near pairs stop early by themselves.
             # They decide in the pixels that they cover, and in others where one pair more, of 1/255, could cover them.
             near = reference.pair_alphas(splats, x, y, reference.near_pairs(splats, x, y, counts))
             in_core = torch.minimum(power - math.log(reference.KERNEL_KEPT), log_alpha - math.log(reference.CORE_MIN))

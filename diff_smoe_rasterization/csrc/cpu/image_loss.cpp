@@ -1,5 +1,5 @@
-// L1 and SSIM on the CPU. Threads take bands of rows of one plane. Windows run along each row, then down the last
-// eleven rows, which are kept in a ring.
+// L1, squares and SSIM on the CPU. Threads take bands of rows of one plane. Windows run along each row, then down the
+// last eleven rows, which are kept in a ring.
 #include "dsmoe/image_loss.h"
 
 #include <algorithm>
@@ -77,6 +77,16 @@ DSMOE_MULTIVERSION double sum_of_differences(const S* __restrict x, const S* __r
   return ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]));
 }
 
+template <class S> DSMOE_MULTIVERSION double sum_of_squares(const S* __restrict x, const S* __restrict y, int count) {
+  double sums[8] = {};
+  int i = 0;
+  for (; i + 8 <= count; i += 8) {
+    for (int j = 0; j < 8; ++j) sums[j] += (x[i + j] - y[i + j]) * (x[i + j] - y[i + j]);
+  }
+  for (; i < count; ++i) sums[0] += (x[i] - y[i]) * (x[i] - y[i]);
+  return ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]));
+}
+
 template <class S> DSMOE_MULTIVERSION double sum_of(const S* __restrict x, int count) {
   double sums[8] = {};
   int i = 0;
@@ -89,9 +99,9 @@ template <class S> DSMOE_MULTIVERSION double sum_of(const S* __restrict x, int c
 
 template <class S>
 DSMOE_MULTIVERSION void gradient_row(const S* __restrict x, const S* __restrict y, const S* __restrict means,
-                                     S l1_scale, S ssim_scale, S* __restrict gradient, int width) {
+                                     S l1_scale, S l2_scale, S ssim_scale, S* __restrict gradient, int width) {
   for (int i = 0; i < width; ++i) {
-    gradient[i] = l1_scale * sign(x[i] - y[i]) +
+    gradient[i] = l1_scale * sign(x[i] - y[i]) + S(2) * l2_scale * (x[i] - y[i]) +
                   ssim_scale * ssim_gradient(x[i], y[i], means[i], means[width + i], means[2 * width + i]);
   }
 }
@@ -174,7 +184,7 @@ template <class S> double value_band(const ImageLoss<S>& loss, int64_t plane, in
   const int width = loss.width;
   const int64_t first = plane * loss.height * width, map_size = loss.planes * loss.height * width;
   std::vector<S> values(4 * static_cast<size_t>(width));
-  double differences = 0, similarity = 0;
+  double differences = 0, squares = 0, similarity = 0;
   RowBlur<S> blur(kNumSsimMoments, width);
   const auto push = [&](int row) {
     const int64_t index = first + static_cast<int64_t>(row) * width;
@@ -183,7 +193,9 @@ template <class S> double value_band(const ImageLoss<S>& loss, int64_t plane, in
     const S* target = target_row(loss, index, y);
     if (target != y) std::copy_n(target, width, y);
     multiply_row(x, y, blur.next_row(2), blur.next_row(3), blur.next_row(4), width);
-    if (begin <= row && row < end) differences += sum_of_differences(x, y, width);
+    if (row < begin || row >= end) return;
+    differences += sum_of_differences(x, y, width);
+    if (loss.l2_weight != 0) squares += sum_of_squares(x, y, width);
   };
   const auto take = [&](int row, const S* means) {
     S* derivatives[kNumSsimDerivatives];
@@ -205,13 +217,14 @@ template <class S> double value_band(const ImageLoss<S>& loss, int64_t plane, in
     }
   };
   blur_band(blur, begin, end, loss.height, push, take);
-  return loss.l1_scale() * differences + loss.ssim_scale() * similarity;
+  return loss.l1_scale() * differences + loss.l2_scale() * squares + loss.ssim_scale() * similarity;
 }
 
 template <class S> void gradient_band(const ImageLoss<S>& loss, int64_t plane, int begin, int end) {
   const int width = loss.width;
   const int64_t first = plane * loss.height * width, map_size = loss.planes * loss.height * width;
-  const S l1_scale = static_cast<S>(loss.l1_scale()), ssim_scale = static_cast<S>(loss.ssim_scale());
+  const S l1_scale = static_cast<S>(loss.l1_scale()), l2_scale = static_cast<S>(loss.l2_scale()),
+          ssim_scale = static_cast<S>(loss.ssim_scale());
   std::vector<S> buffer(width);
   RowBlur<S> blur(kNumSsimDerivatives, width);
   const auto push = [&](int row) {
@@ -221,7 +234,7 @@ template <class S> void gradient_band(const ImageLoss<S>& loss, int64_t plane, i
   };
   const auto take = [&](int row, const S* means) {
     const int64_t index = first + static_cast<int64_t>(row) * width;
-    gradient_row(loss.image + index, target_row(loss, index, buffer.data()), means, l1_scale, ssim_scale,
+    gradient_row(loss.image + index, target_row(loss, index, buffer.data()), means, l1_scale, l2_scale, ssim_scale,
                  loss.gradient + index, width);
   };
   blur_band(blur, begin, end, loss.height, push, take);

@@ -10,7 +10,7 @@ namespace {
 
 constexpr int64_t kChunk = 1024;  // rows a thread takes at a time
 
-template <class S> void catch_up_row(const LazyAdam<S>& adam, int64_t row) {
+template <class S> void catch_up_row(const LazyAdam<S>& adam, int32_t steps, int64_t row) {
   const LazyAdamMark mark(adam.marks[row]);
   for (int t = 0; t < adam.num_tensors; ++t) {
     const LazyAdamTensor<S>& tensor = adam.tensors[t];
@@ -22,31 +22,33 @@ template <class S> void catch_up_row(const LazyAdam<S>& adam, int64_t row) {
         adam_step(adam.constants, rates(), tensor.gradient[i], tensor.parameter[i], tensor.moment[i], tensor.square[i]);
         ++step;
       }
-      for (; step < adam.steps; ++step) {
+      for (; step < steps; ++step) {
         adam_rest_step(adam.constants, rates(), tensor.parameter[i], tensor.moment[i], tensor.square[i]);
       }
     }
   }
-  adam.marks[row] = adam.steps;
+  adam.marks[row] = steps;
 }
 
 }  // namespace
 
 template <class S> void catch_up(const LazyAdam<S>& adam, int num_threads) {
   refuse_catch_up("cpu::catch_up", adam);
+  const int32_t steps = adam.num_steps();
   parallel_for(num_threads, adam.num_rows, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {
       const bool wanted = adam.radii == nullptr || adam.radii[row] > 0;
-      if (wanted && adam.marks[row] != adam.steps) catch_up_row(adam, row);
+      if (wanted && adam.marks[row] != steps) catch_up_row(adam, steps, row);
     }
   });
 }
 
 template <class S> void note_step(const LazyAdamStep<S>& step) {
   refuse_note_step("cpu::note_step", step);
-  for (int t = 0; t < step.num_tensors; ++t) step.rates[t] = step.new_rates[t];
+  const int32_t steps = step.num_steps();
+  for (int t = 0; t < step.num_tensors; ++t) step.rates[int64_t(steps) * step.num_tensors + t] = step.new_rate(t);
   for (int64_t row = 0; row < step.num_rows; ++row) {
-    if (step.radii[row] > 0) step.marks[row] = ~step.steps;
+    if (step.radii[row] > 0) step.marks[row] = ~steps;
   }
 }
 

@@ -59,7 +59,14 @@ __global__ void take_larger_kernel(int64_t* num_instances, const int64_t* num_en
   *num_instances = max(*num_instances, *num_entries);
 }
 
+__global__ void write_number_kernel(const int64_t* number, int64_t* to) { *to = *number; }
+
 }  // namespace
+
+void write_number(const int64_t* number, int64_t* to, cudaStream_t stream) {
+  write_number_kernel<<<1, 1, 0, stream>>>(number, to);
+  DSMOE_CHECK_LAUNCH("write_number");
+}
 
 bool needs_depth_order(BlendMode mode) {
   bool needed = false;

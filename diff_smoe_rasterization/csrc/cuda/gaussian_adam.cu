@@ -29,7 +29,8 @@ template <int kSize, class S> __device__ void store(const S (&from)[kSize], S* t
 
 // Steps what a block has of a tensor: kCount groups of kSize numbers a thread.
 template <int kSize, int kCount, class S>
-__device__ void step_piece(const GaussianAdam<S>& adam, const ActivatedTensor<S>& tensor, int64_t block) {
+__device__ void step_piece(const GaussianAdam<S>& adam, const ActivatedTensor<S>& tensor, const AdamRates<S>& rates,
+                           int64_t block) {
   const int64_t groups = adam.num_gaussians * (tensor.row_size / kSize);
   const int64_t begin = block * (kAdamBlock * kCount) + threadIdx.x;
   const bool activated = tensor.activation != Activation::kNone;
@@ -53,9 +54,9 @@ __device__ void step_piece(const GaussianAdam<S>& adam, const ActivatedTensor<S>
     const int64_t group = begin + k * kAdamBlock, i = group * kSize;
     if (group >= groups) continue;
     if constexpr (kSize == 1) {
-      step_number(adam.constants, tensor.activation, tensor.rates, numbers[k]);
+      step_number(adam.constants, tensor.activation, rates, numbers[k]);
     } else {
-      step_quaternion(adam.constants, tensor.rates, seen[k], numbers[k]);
+      step_quaternion(adam.constants, rates, seen[k], numbers[k]);
     }
     store(numbers[k].raw, tensor.raw + i);
     store(numbers[k].moment, tensor.moment + i);
@@ -69,11 +70,12 @@ __global__ void __launch_bounds__(kAdamBlock) step_gaussians_kernel(const __grid
   int t = 0;
   while (t + 1 < kGaussianAdamTensors && blockIdx.x >= blocks.first[t + 1]) ++t;
   const ActivatedTensor<S>& tensor = blocks.adam.tensors[t];
+  const AdamRates<S> rates = blocks.adam.rates(t);
   const int64_t block = blockIdx.x - blocks.first[t];
   if (tensor.activation == Activation::kUnitQuaternion) {
-    step_piece<4, kAdamPerThread / 4>(blocks.adam, tensor, block);
+    step_piece<4, kAdamPerThread / 4>(blocks.adam, tensor, rates, block);
   } else {
-    step_piece<1, kAdamPerThread>(blocks.adam, tensor, block);
+    step_piece<1, kAdamPerThread>(blocks.adam, tensor, rates, block);
   }
 }
 

@@ -1,4 +1,4 @@
-// Passes over all Gaussians: a thread each.
+// Passes over all Gaussians, or over what else there are many of: a thread each.
 #include "dsmoe/gaussians.h"
 #include "tuning.cuh"
 
@@ -23,7 +23,9 @@ template <class Pass> void for_each_gaussian(const Pass& pass, int64_t count, vo
 #define DSMOE_INSTANTIATE(S)                                                   \
   template void for_each_gaussian(const Activate<S>&, int64_t, void*);         \
   template void for_each_gaussian(const ActivateBackward<S>&, int64_t, void*); \
-  template void for_each_gaussian(const AddView<S>&, int64_t, void*);
+  template void for_each_gaussian(const AddView<S>&, int64_t, void*);          \
+  template void for_each_gaussian(const GateStep<S>&, int64_t, void*);         \
+  template void for_each_gaussian(const StepInputs<S>&, int64_t, void*);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

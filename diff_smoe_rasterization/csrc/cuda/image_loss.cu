@@ -1,5 +1,5 @@
-// L1 and SSIM. One kernel computes the values, and SSIM's derivatives by the local moments; one the gradient; one adds
-// up. A block computes one tile of one plane. Windows run along rows, then along columns, in shared memory.
+// L1, squares and SSIM. One kernel computes the values, and SSIM's derivatives by the local moments; one the gradient;
+// one adds up. A block computes one tile of one plane. Windows run along rows, then along columns, in shared memory.
 #include "../refuse_training.h"
 #include "dsmoe/image_loss.h"
 #include "tuning.cuh"
@@ -110,6 +110,7 @@ __device__ double block_sum(double value) {
 template <class S> struct LossWeights {
   SsimWindow<S> window;  // along each axis
   S l1;                  // a pixel's |x - y|
+  S l2;                  // a pixel's (x - y)^2
   S ssim;                // a pixel's SSIM
 };
 
@@ -164,7 +165,8 @@ __global__ void __launch_bounds__(kLossBlock)
       const Ssim<S> pixel = ssim(SsimMoments<S>{means[0][r], means[1][r], means[2][r], means[3][r], means[4][r]});
       const S difference =
           image[row + kSsimRadius][column + kSsimRadius] - target[row + kSsimRadius][column + kSsimRadius];
-      sum += weights.l1 * abs(difference) + (counts ? weights.ssim * pixel.value : S(0));
+      sum += weights.l1 * abs(difference) + weights.l2 * (difference * difference) +
+             (counts ? weights.ssim * pixel.value : S(0));
       if (loss.derivatives != nullptr) {
         const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
         loss.derivatives[index] = counts ? pixel.d_mean : S(0);
@@ -219,8 +221,8 @@ __global__ void __launch_bounds__(kLossBlock)
       if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
       const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
       const S x = loss.image[index], y = target_value(loss, index);
-      loss.gradient[index] =
-          weights.l1 * sign(x - y) + weights.ssim * ssim_gradient(x, y, means[0][r], means[1][r], means[2][r]);
+      loss.gradient[index] = weights.l1 * sign(x - y) + S(2) * weights.l2 * (x - y) +
+                             weights.ssim * ssim_gradient(x, y, means[0][r], means[1][r], means[2][r]);
     }
   });
 }
@@ -251,7 +253,8 @@ template <class S> void image_loss(const ImageLoss<S>& loss, void* stream) {
   refuse_image_loss("cuda::image_loss", loss);
   const auto cuda_stream = static_cast<cudaStream_t>(stream);
   const int64_t blocks = num_blocks<S>(loss.planes, loss.height, loss.width);
-  const LossWeights<S> weights = {ssim_window<S>(), static_cast<S>(loss.l1_scale()), static_cast<S>(loss.ssim_scale())};
+  const LossWeights<S> weights = {ssim_window<S>(), static_cast<S>(loss.l1_scale()), static_cast<S>(loss.l2_scale()),
+                                  static_cast<S>(loss.ssim_scale())};
   const unsigned grid = static_cast<unsigned>(blocks);
   value_kernel<<<grid, kLossBlock, 0, cuda_stream>>>(loss, weights);
   DSMOE_CHECK_LAUNCH("the loss");

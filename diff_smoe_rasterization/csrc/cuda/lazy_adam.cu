@@ -40,7 +40,7 @@ template <class S> struct Column {
 // Makes the steps that a row has missed on the columns of a lane. Those that do not exist compute with zeros.
 template <class S>
 __device__ void catch_up_row(const LazyAdam<S>& adam, const Column<S> (&columns)[kRowNumbers], int64_t row,
-                             LazyAdamMark mark) {
+                             LazyAdamMark mark, int32_t steps) {
   S gradient[kRowNumbers], parameter[kRowNumbers] = {}, moment[kRowNumbers] = {}, square[kRowNumbers] = {};
 #pragma unroll
   for (int k = 0; k < kRowNumbers; ++k) {
@@ -61,7 +61,7 @@ __device__ void catch_up_row(const LazyAdam<S>& adam, const Column<S> (&columns)
     ++step;
   }
 #pragma unroll 1
-  for (; step < adam.steps; ++step) {
+  for (; step < steps; ++step) {
 #pragma unroll
     for (int k = 0; k < kRowNumbers; ++k) {
       if (!columns[k].exists) continue;
@@ -82,15 +82,16 @@ __global__ void __launch_bounds__(kAdamBlock, kBlocks<S>) catch_up_kernel(const 
   __shared__ int32_t shared_rows[kWarps][kWarp], shared_marks[kWarps][kWarp];
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const int64_t row = int64_t(blockIdx.x) * kAdamBlock + threadIdx.x;
+  const int32_t steps = adam.num_steps();
   const bool wanted = row < adam.num_rows && (adam.radii == nullptr || adam.radii[row] > 0);
-  const int32_t mark = wanted ? adam.marks[row] : adam.steps;
-  const unsigned stale = __ballot_sync(kAllLanes, mark != adam.steps);
+  const int32_t mark = wanted ? adam.marks[row] : steps;
+  const unsigned stale = __ballot_sync(kAllLanes, mark != steps);
   if (stale == 0) return;
   if (stale >> lane & 1) {
     const int place = __popc(stale & ((1u << lane) - 1));
     shared_rows[warp][place] = lane;
     shared_marks[warp][place] = mark;
-    adam.marks[row] = adam.steps;
+    adam.marks[row] = steps;
   }
   __syncwarp();
   int numbers = 0;
@@ -99,7 +100,7 @@ __global__ void __launch_bounds__(kAdamBlock, kBlocks<S>) catch_up_kernel(const 
     const Column<S> columns[kRowNumbers] = {Column<S>(adam, begin), Column<S>(adam, begin + kRowLanes),
                                             Column<S>(adam, begin + 2 * kRowLanes)};
     for (int n = lane / kRowLanes; n < __popc(stale); n += kWarp / kRowLanes) {
-      catch_up_row(adam, columns, row - lane + shared_rows[warp][n], LazyAdamMark(shared_marks[warp][n]));
+      catch_up_row(adam, columns, row - lane + shared_rows[warp][n], LazyAdamMark(shared_marks[warp][n]), steps);
     }
   }
 }
@@ -107,8 +108,10 @@ __global__ void __launch_bounds__(kAdamBlock, kBlocks<S>) catch_up_kernel(const 
 template <class S>
 __global__ void __launch_bounds__(kStoreBlock) note_step_kernel(const __grid_constant__ LazyAdamStep<S> step) {
   const int64_t row = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
-  if (row < step.num_tensors) step.rates[row] = step.new_rates[row];
-  if (row < step.num_rows && step.radii[row] > 0) step.marks[row] = ~step.steps;
+  const int32_t steps = step.num_steps();
+  if (row < step.num_tensors)
+    step.rates[int64_t(steps) * step.num_tensors + row] = step.new_rate(static_cast<int>(row));
+  if (row < step.num_rows && step.radii[row] > 0) step.marks[row] = ~steps;
 }
 
 }  // namespace

@@ -42,8 +42,9 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
   const int64_t most = frame.config.most_instances;
-  int64_t capacity = InstanceCapacities::shared().likely(key, frame.inputs.num_gaussians);
-  if (is_capturing(run.stream)) {  // nothing can be counted then
+  const bool captured = is_capturing(run.stream);
+  int64_t capacity = InstanceCapacities::shared().likely(key, frame.inputs.num_gaussians, captured);
+  if (captured) {  // nothing can be counted then
     if (capacity < 0) capacity = 8 * frame.inputs.num_gaussians + 1024;
     return std::max<int64_t>(1, std::min(capacity, most));
   }

@@ -19,6 +19,10 @@ template <class T> T* allocate(Scratch& scratch, int64_t count) {
   return static_cast<T*>(memory);
 }
 
+// Writes a number of the device to pinned memory of the host, later. A kernel does it: in a graph all that follows
+// would wait for a copy.
+void write_number(const int64_t* number, int64_t* to, cudaStream_t stream);
+
 // Waits for a number of the device.
 template <class T> T read(const T* number, const char* what, cudaStream_t stream) {
   T value = 0;

@@ -134,6 +134,9 @@ PYBIND11_MODULE(_core, module) {
   module.attr("options") = options();
   module.attr("saved") = saved();
   module.def("build_info", &build_info);
+#ifdef DSMOE_WITH_CUDA
+  module.def("recent_instances", &cuda::recent_instances);
+#endif
   module.def("set_most_instances", &binding::set_most_instances);
   module.def("set_profiling", &binding::set_profiling);
   module.def("stage_times", &stage_times);

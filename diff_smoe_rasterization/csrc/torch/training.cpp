@@ -56,10 +56,10 @@ struct ImageLoss : torch::autograd::Function<ImageLoss> {
   static at::Tensor forward(AutogradContext* context, const at::Tensor& image, const at::Tensor& target,
                             double l1_weight, double ssim_weight, double offset, bool with_gradient) {
     static const c10::OperatorHandle op = find_op("image_loss");
-    using Signature =
-        std::tuple<at::Tensor, at::Tensor>(const at::Tensor&, const at::Tensor&, double, double, double, int64_t, bool);
+    using Signature = std::tuple<at::Tensor, at::Tensor>(const at::Tensor&, const at::Tensor&, double, double, double,
+                                                         double, int64_t, bool);
     const auto [loss, gradient] =
-        call_op<Signature>(op, image, target, l1_weight, ssim_weight, offset, int64_t(0), with_gradient);
+        call_op<Signature>(op, image, target, l1_weight, 0.0, ssim_weight, offset, int64_t(0), with_gradient);
     context->save_for_backward({gradient});
     return loss;
   }

@@ -3,6 +3,7 @@
 // define the Backends.
 #pragma once
 
+#include <algorithm>
 #include <climits>
 #include <string>
 #include <tuple>
@@ -71,10 +72,15 @@ void adam(const Tensors& parameters, const Tensors& gradients, const Tensors& mo
   for (const Tensors* list : {&parameters, &moments, &squares}) note_change(*list);
 }
 
+// Numbers that the device holds; null where there are none.
+template <class S> const S* given_numbers(const OptionalTensor& numbers) {
+  return numbers.has_value() ? numbers->data_ptr<S>() : nullptr;
+}
+
 template <class Backend>
 void lazy_adam_catch_up(const Tensors& parameters, const Tensors& moments, const Tensors& squares,
                         const Tensors& gradients, const Tensor& marks, const Tensor& rates, int64_t steps, double beta1,
-                        double beta2, double epsilon, const OptionalTensor& radii) {
+                        double beta2, double epsilon, const OptionalTensor& radii, const OptionalTensor& given_steps) {
   const char* function = "lazy_adam_catch_up";
   const auto count = static_cast<int64_t>(parameters.size());
   DSMOE_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors, function, ": ", count,
@@ -92,6 +98,7 @@ void lazy_adam_catch_up(const Tensors& parameters, const Tensors& moments, const
   expect.dense("marks", marks, {first.size(0)}, kInt);
   if (radii.has_value()) expect.dense("radii", *radii, {first.size(0)}, kInt);
   expect.dense("rates", rates, {"capacity", count, 2});
+  if (given_steps.has_value()) expect.dense("given_steps", *given_steps, {1});
   DSMOE_CHECK_VALUE(0 <= steps && steps <= rates.size(0), function, ": steps is ", steps, "; rates has ", rates.size(0),
                     " of them");
   const DeviceGuard guard(first.device());
@@ -109,6 +116,7 @@ void lazy_adam_catch_up(const Tensors& parameters, const Tensors& moments, const
     adam.radii = radii.has_value() ? radii->data_ptr<int32_t>() : nullptr;
     adam.rates = reinterpret_cast<const AdamRates<scalar_t>*>(rates.data_ptr<scalar_t>());
     adam.steps = static_cast<int32_t>(steps);
+    adam.given_steps = given_numbers<scalar_t>(given_steps);
     adam.constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
     Backend::catch_up(adam);
   });
@@ -118,7 +126,8 @@ void lazy_adam_catch_up(const Tensors& parameters, const Tensors& moments, const
 
 template <class Backend>
 void lazy_adam_step(const Tensor& marks, const Tensor& rates, int64_t steps, const std::vector<double>& new_rates,
-                    const std::vector<double>& root_scales, const Tensor& radii) {
+                    const std::vector<double>& root_scales, const Tensor& radii, const OptionalTensor& given_steps,
+                    const OptionalTensor& given_rates) {
   const char* function = "lazy_adam_step";
   const auto count = static_cast<int64_t>(new_rates.size());
   DSMOE_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function, ": ",
@@ -128,6 +137,8 @@ void lazy_adam_step(const Tensor& marks, const Tensor& rates, int64_t steps, con
   expect.dense("rates", rates, {"capacity", count, 2});
   expect.dense("marks", marks, {"N"}, kInt);
   expect.dense("radii", radii, {marks.size(0)}, kInt);
+  if (given_steps.has_value()) expect.dense("given_steps", *given_steps, {1});
+  if (given_rates.has_value()) expect.dense("given_rates", *given_rates, {count, 2});
   DSMOE_CHECK_VALUE(0 <= steps && steps < rates.size(0), function, ": steps is ", steps, "; rates has room for ",
                     rates.size(0));
   const DeviceGuard guard(marks.device());
@@ -137,12 +148,14 @@ void lazy_adam_step(const Tensor& marks, const Tensor& rates, int64_t steps, con
     step.num_rows = marks.size(0);
     step.marks = marks.data_ptr<int32_t>();
     step.radii = radii.data_ptr<int32_t>();
-    step.rates = reinterpret_cast<AdamRates<scalar_t>*>(rates.data_ptr<scalar_t>()) + steps * count;
+    step.rates = reinterpret_cast<AdamRates<scalar_t>*>(rates.data_ptr<scalar_t>());
     for (int64_t i = 0; i < count; ++i) {
       step.new_rates[i] = {static_cast<scalar_t>(new_rates[i]), static_cast<scalar_t>(root_scales[i])};
     }
     step.num_tensors = static_cast<int>(count);
     step.steps = static_cast<int32_t>(steps);
+    step.given_steps = given_numbers<scalar_t>(given_steps);
+    step.given_rates = reinterpret_cast<const AdamRates<scalar_t>*>(given_numbers<scalar_t>(given_rates));
     Backend::note_step(step);
   });
   note_change({marks, rates});
@@ -151,7 +164,8 @@ void lazy_adam_step(const Tensor& marks, const Tensor& rates, int64_t steps, con
 template <class Backend>
 void gaussian_adam(const Tensors& raw, const Tensors& values, const Tensors& dL_dvalues, const Tensors& moments,
                    const Tensors& squares, const Tensor& radii, const std::vector<double>& rates,
-                   const std::vector<double>& root_scales, double beta1, double beta2, double epsilon) {
+                   const std::vector<double>& root_scales, double beta1, double beta2, double epsilon,
+                   const OptionalTensor& given_rates) {
   const char* function = "gaussian_adam";
   constexpr Activation kActivations[] = {Activation::kNone, Activation::kSigmoid, Activation::kExp,
                                          Activation::kUnitQuaternion};
@@ -168,12 +182,14 @@ void gaussian_adam(const Tensors& raw, const Tensors& values, const Tensors& dL_
   expect.dense_alike("moments", moments, raw);
   expect.dense_alike("squares", squares, raw);
   expect.dense("radii", radii, {count}, kInt);
+  if (given_rates.has_value()) expect.dense("given_rates", *given_rates, {kGaussianAdamTensors, 2});
   const DeviceGuard guard(raw[0].device());
   dispatch_real(raw[0], [&](auto zero) {
     using scalar_t = decltype(zero);
     GaussianAdam<scalar_t> adam = {};
     adam.num_gaussians = count;
     adam.radii = radii.data_ptr<int32_t>();
+    adam.given_rates = reinterpret_cast<const AdamRates<scalar_t>*>(given_numbers<scalar_t>(given_rates));
     adam.constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
     for (size_t i = 0; i < raw.size(); ++i) {
       adam.tensors[i] = {raw[i].data_ptr<scalar_t>(),
@@ -238,8 +254,8 @@ template <class Backend> Tensors gather_rows(const Tensors& tensors, const Tenso
 
 // The loss and, if it is wanted, its gradient by the image; an empty tensor otherwise.
 template <class Backend>
-std::tuple<Tensor, Tensor> image_loss(const Tensor& image, const Tensor& target, double l1_weight, double ssim_weight,
-                                      double offset, int64_t margin, bool with_gradient) {
+std::tuple<Tensor, Tensor> image_loss(const Tensor& image, const Tensor& target, double l1_weight, double l2_weight,
+                                      double ssim_weight, double offset, int64_t margin, bool with_gradient) {
   const char* function = "image_loss";
   const Expect expect(function, "image", image);
   expect("image", image, shape_of(image.sizes()));
@@ -268,7 +284,8 @@ std::tuple<Tensor, Tensor> image_loss(const Tensor& image, const Tensor& target,
     arguments.planes = planes;
     arguments.height = static_cast<int>(height), arguments.width = static_cast<int>(width);
     arguments.margin = static_cast<int>(margin);
-    arguments.l1_weight = l1_weight, arguments.ssim_weight = ssim_weight, arguments.offset = offset;
+    arguments.l1_weight = l1_weight, arguments.l2_weight = l2_weight;
+    arguments.ssim_weight = ssim_weight, arguments.offset = offset;
     const Tensor sums = empty({Backend::template num_image_loss_sums<scalar_t>(arguments)}, x, kDouble);
     arguments.sums = sums.data_ptr<double>();
     arguments.loss = loss.data_ptr<scalar_t>();
@@ -368,6 +385,77 @@ void add_view(const Tensor& dL_dmeans2D, const Tensor& radii, const Tensor& grad
   note_change({gradient_sum, view_count});
 }
 
+template <class Backend>
+void gate_adam(const Tensor& logarithm, const Tensor& moment, const Tensor& square, const Tensor& gate,
+               const Tensor& gradient, double rate, double root_scale, double beta1, double beta2, double epsilon,
+               double bound, double limit) {
+  const Expect expect("gate_adam", "logarithm", logarithm);
+  expect.dense("logarithm", logarithm, {1});
+  expect.dense("moment", moment, {1});
+  expect.dense("square", square, {1});
+  expect.dense("gate", gate, {1});
+  expect.dense("gradient", gradient, {1});
+  const DeviceGuard guard(logarithm.device());
+  dispatch_real(logarithm, [&](auto zero) {
+    using scalar_t = decltype(zero);
+    GateStep<scalar_t> pass = {};
+    pass.logarithm = logarithm.data_ptr<scalar_t>();
+    pass.moment = moment.data_ptr<scalar_t>();
+    pass.square = square.data_ptr<scalar_t>();
+    pass.gate = gate.data_ptr<scalar_t>();
+    pass.gradient = gradient.data_ptr<scalar_t>();
+    pass.bound = static_cast<scalar_t>(bound);
+    pass.limit = static_cast<scalar_t>(limit);
+    pass.constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
+    pass.rates = {static_cast<scalar_t>(rate), static_cast<scalar_t>(root_scale)};
+    Backend::for_each_gaussian(pass, 1);
+  });
+  note_change({logarithm, moment, square, gate});
+}
+
+template <class Backend>
+void set_inputs(const Tensors& to, const Tensors& source, const Tensor& numbers,
+                const std::vector<double>& new_numbers) {
+  const char* function = "set_inputs";
+  using Limits = StepInputs<float>;
+  const Expect expect(function, "numbers", numbers);
+  check_length(function, "source", source.size(), to.size());
+  DSMOE_CHECK_VALUE(to.size() <= Limits::kMostArrays, function, ": to has length ", to.size(), "; it must be at most ",
+                    Limits::kMostArrays);
+  DSMOE_CHECK_VALUE(new_numbers.size() <= Limits::kMostNumbers, function, ": new_numbers has length ",
+                    new_numbers.size(), "; it must be at most ", Limits::kMostNumbers);
+  expect.dense("numbers", numbers, {static_cast<int64_t>(new_numbers.size())});
+  for (size_t i = 0; i < to.size(); ++i) {
+    const auto type = source[i].scalar_type();
+    DSMOE_CHECK_TYPE(type == kByte || type == kInt || type == kFloat || type == kDouble, function, ": ",
+                     item_name("source", i), " is ", dtype_name(type), "; it must be uint8, int32, float32 or float64");
+    expect.dense(item_name("source", i), source[i], shape_of(source[i].sizes()), type);
+    expect.dense(item_name("to", i), to[i], shape_of(source[i].sizes()), type);
+  }
+  const DeviceGuard guard(numbers.device());
+  dispatch_real(numbers, [&](auto zero) {
+    using scalar_t = decltype(zero);
+    StepInputs<scalar_t> pass = {};
+    pass.numbers = numbers.data_ptr<scalar_t>();
+    pass.num_numbers = static_cast<int>(new_numbers.size());
+    std::copy(new_numbers.begin(), new_numbers.end(), pass.new_numbers);
+    int64_t end = 0;
+    for (size_t i = 0; i < to.size(); ++i) {
+      const auto type = source[i].scalar_type();
+      const auto* from = static_cast<const unsigned char*>(source[i].data_ptr());
+      auto* into = static_cast<unsigned char*>(to[i].data_ptr());
+      const int64_t bytes = source[i].numel() * (type == kByte ? 1 : type == kDouble ? 8 : 4);
+      const auto places = reinterpret_cast<uintptr_t>(from) | reinterpret_cast<uintptr_t>(into);
+      end += StepInputs<scalar_t>::num_pieces(bytes);
+      pass.arrays[i] = {from, into, bytes, end, places % sizeof(typename StepInputs<scalar_t>::Piece) == 0};
+    }
+    pass.num_arrays = static_cast<int>(to.size());
+    Backend::for_each_gaussian(pass, pass.count());
+  });
+  note_change(to);
+  note_change({numbers});
+}
+
 // Of `mean_squared_neighbour_distances`, whose implementations share no more.
 inline void check_points(const Tensor& points) {
   const Expect expect("distCUDA2", "points", points);
@@ -386,6 +474,8 @@ template <class Backend> void register_training_ops(Library& m) {
   implement<&with_arguments<&activate<Backend>>>(m, "activate");
   implement<&with_arguments<&activate_backward<Backend>>>(m, "activate_backward");
   implement<&with_arguments<&add_view<Backend>>>(m, "add_view");
+  implement<&with_arguments<&gate_adam<Backend>>>(m, "gate_adam");
+  implement<&with_arguments<&set_inputs<Backend>>>(m, "set_inputs");
   implement<&with_arguments<&Backend::mean_squared_neighbour_distances>>(m, "mean_squared_neighbour_distances");
 }
 

@@ -31,9 +31,13 @@ constexpr int kGaussianAdamTensors = 4;  // means, opacities, scales, rotations
 
 template <class S> struct GaussianAdam {
   ActivatedTensor<S> tensors[kGaussianAdamTensors];
-  int64_t num_gaussians;  // N
-  const int32_t* radii;   // [N] above 0 where a Gaussian was seen; the others have no gradient
+  int64_t num_gaussians;            // N
+  const int32_t* radii;             // [N] above 0 where a Gaussian was seen; the others have no gradient
+  const AdamRates<S>* given_rates;  // [kGaussianAdamTensors] in place of those of the tensors, or null
   AdamConstants<S> constants;
+
+  // Of tensor t.
+  DSMOE_HD AdamRates<S> rates(int t) const { return given_rates != nullptr ? given_rates[t] : tensors[t].rates; }
 };
 
 // What a step reads and changes of kSize numbers.

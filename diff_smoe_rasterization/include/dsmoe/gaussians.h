@@ -1,9 +1,10 @@
-// Passes over all Gaussians between the optimizer and the rasterizer, on the CPU and on a GPU.
+// Passes of a training step over all Gaussians, or over what else a step has many of, on the CPU and on a GPU.
 #pragma once
 
 #include <cstdint>
 
 #include "dsmoe/activations.h"
+#include "dsmoe/adam.h"
 
 namespace dsmoe {
 
@@ -66,9 +67,73 @@ template <class S> struct AddView {
   }
 };
 
+// One step of Adam on the background's gate lambda = bound + exp(p), and lambda anew. There is one i.
+template <class S> struct GateStep {
+  S* logarithm;       // [1] p
+  S* moment;          // [1] mean gradient
+  S* square;          // [1] mean squared gradient
+  S* gate;            // [1] lambda, written
+  const S* gradient;  // [1] by lambda
+  S bound;
+  S limit;  // of |p|
+  AdamConstants<S> constants;
+  AdamRates<S> rates;
+
+  DSMOE_HD void operator()(int64_t) const {
+    S p = *logarithm;
+    adam_step(constants, rates, *gradient * exp(p), p, *moment, *square);
+    p = p < -limit ? -limit : p > limit ? limit : p;
+    *logarithm = p;
+    *gate = exp(p) + bound;
+  }
+};
+
+// What a step that repeats reads anew each time: numbers of the host, and copies of some arrays. There is an i for each
+// number, and for each piece of the arrays.
+template <class S> struct StepInputs {
+  static constexpr int kMostArrays = 8, kMostNumbers = 32;
+  struct alignas(16) Piece {
+    uint32_t words[4];
+  };
+  struct Array {
+    const unsigned char* from;
+    unsigned char* to;
+    int64_t bytes;
+    int64_t end;   // pieces of this array and of those before
+    bool aligned;  // both begin where a piece may
+  };
+  Array arrays[kMostArrays];
+  int num_arrays;
+  int num_numbers;
+  S* numbers;  // [num_numbers] written
+  S new_numbers[kMostNumbers];
+
+  static constexpr int64_t num_pieces(int64_t bytes) {
+    return (bytes + static_cast<int64_t>(sizeof(Piece)) - 1) / static_cast<int64_t>(sizeof(Piece));
+  }
+  int64_t count() const { return num_numbers + (num_arrays > 0 ? arrays[num_arrays - 1].end : 0); }
+
+  DSMOE_HD void operator()(int64_t i) const {
+    if (i < num_numbers) {
+      numbers[i] = new_numbers[i];
+      return;
+    }
+    int64_t piece = i - num_numbers;
+    int a = 0;
+    while (piece >= arrays[a].end) ++a;
+    const Array& array = arrays[a];
+    const int64_t size = sizeof(Piece), begin = size * (a > 0 ? piece - arrays[a - 1].end : piece);
+    if (array.aligned && begin + size <= array.bytes) {
+      *reinterpret_cast<Piece*>(array.to + begin) = *reinterpret_cast<const Piece*>(array.from + begin);
+    } else {
+      for (int64_t k = begin; k < begin + size && k < array.bytes; ++k) array.to[k] = array.from[k];
+    }
+  }
+};
+
 namespace cuda {
 
-// Calls pass(i) for all of `count` Gaussians, on the current device and asynchronously on `stream`, a cudaStream_t.
+// Calls pass(i) for all i below `count`, on the current device and asynchronously on `stream`, a cudaStream_t.
 // Pass: one of those above, of float or double, with pointers to memory of the device. Throws std::runtime_error where
 // the launch fails.
 template <class Pass> void for_each_gaussian(const Pass& pass, int64_t count, void* stream);

@@ -1,4 +1,4 @@
-// Mean absolute difference and SSIM of two images with the gradient, on the CPU and on a GPU.
+// Mean absolute and squared difference and SSIM of two images with the gradient, on the CPU and on a GPU.
 #pragma once
 
 #include <cstdint>
@@ -7,7 +7,7 @@
 
 namespace dsmoe {
 
-// loss = offset + l1_weight mean |x - y| + ssim_weight mean SSIM(x, y)
+// loss = offset + l1_weight mean |x - y| + l2_weight mean (x - y)^2 + ssim_weight mean SSIM(x, y)
 template <class S> struct ImageLoss {
   const S* image;               // [planes, height, width] x
   const S* target;              // [planes, height, width] y, or null
@@ -15,7 +15,7 @@ template <class S> struct ImageLoss {
   int64_t planes;
   int height, width;
   int margin;  // pixels at each side of a plane that the mean of SSIM leaves out
-  double l1_weight, ssim_weight, offset;
+  double l1_weight, l2_weight, ssim_weight, offset;
   S* loss;         // [1]
   S* gradient;     // [planes, height, width] by x, or null
   S* derivatives;  // [3, planes, height, width] scratch of the gradient, or null
@@ -23,6 +23,7 @@ template <class S> struct ImageLoss {
 
   // What one pixel's terms are multiplied by.
   double l1_scale() const { return l1_weight / static_cast<double>(planes * height * width); }
+  double l2_scale() const { return l2_weight / static_cast<double>(planes * height * width); }
   double ssim_scale() const {
     return ssim_weight / static_cast<double>(planes * (height - 2 * margin) * (width - 2 * margin));
   }

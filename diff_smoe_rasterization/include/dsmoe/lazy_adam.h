@@ -32,7 +32,10 @@ template <class S> struct LazyAdam {
   const int32_t* radii;       // [N] above 0 in rows that are brought up to date; or null: all are
   const AdamRates<S>* rates;  // [steps, num_tensors] of each step
   int32_t steps;              // how many there have been
+  const S* given_steps;       // [1] a whole number in place of `steps`, or null
   AdamConstants<S> constants;
+
+  DSMOE_HD int32_t num_steps() const { return given_steps != nullptr ? static_cast<int32_t>(*given_steps) : steps; }
 };
 
 // A row's mark, spread.
@@ -47,10 +50,15 @@ template <class S> struct LazyAdamStep {
   int64_t num_rows;      // N
   int32_t* marks;        // [N] written where radii is above 0; these rows are up to date
   const int32_t* radii;  // [N] above 0 in rows that have a gradient
-  AdamRates<S>* rates;   // [num_tensors] of this step, written
+  AdamRates<S>* rates;   // [steps + 1, num_tensors] of each step; those of this one are written
   AdamRates<S> new_rates[kLazyAdamMaxTensors];
   int num_tensors;
-  int32_t steps;  // made before this one
+  int32_t steps;                    // made before this one
+  const S* given_steps;             // [1] a whole number in place of `steps`, or null
+  const AdamRates<S>* given_rates;  // [num_tensors] in place of new_rates, or null
+
+  DSMOE_HD int32_t num_steps() const { return given_steps != nullptr ? static_cast<int32_t>(*given_steps) : steps; }
+  DSMOE_HD AdamRates<S> new_rate(int t) const { return given_rates != nullptr ? given_rates[t] : new_rates[t]; }
 };
 
 namespace cpu {

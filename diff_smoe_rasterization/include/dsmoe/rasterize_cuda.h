@@ -136,6 +136,11 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
 template <class S>
 void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory);
 
+// How many tile instances a rendering of this size, blend mode (as a number) and about so many Gaussians had at most
+// lately, as far as the current device has counted; -1 where nothing is known. Does not wait. A captured graph whose
+// lists have less room is slow.
+int64_t recent_instances(int64_t width, int64_t height, int64_t blend_mode, int64_t num_gaussians);
+
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory);
 

@@ -31,6 +31,24 @@ TEST(InstanceCapacities, GrowWithTheNumberOfGaussians) {
   EXPECT_GT(render(capacities, 1'000'000, 10'000'000), 10'000'000);
 }
 
+TEST(InstanceCapacities, KnowTwiceAndHalfAsManyGaussians) {
+  InstanceCapacities capacities;
+  for (int i = 0; i < 100; ++i) render(capacities, 500'000, 5'000'000);  // 2^19 is 524'288
+  EXPECT_GT(render(capacities, 530'000, 5'300'000), 5'300'000);
+  EXPECT_GT(render(capacities, 530'000, 5'300'000), 5'300'000) << "what it learned anew";
+  EXPECT_GT(render(capacities, 260'000, 2'600'000), 2'600'000);
+  EXPECT_EQ(render(capacities, 100'000, 1'000'000), -1);
+}
+
+TEST(InstanceCapacities, GiveAGraphHalfAsMuchAgain) {
+  InstanceCapacities capacities;
+  for (int i = 0; i < 100; ++i) render(capacities, 500'000, 5'000'000);
+  const Key key = InstanceCapacities::key(0, 800, 600, 0, 500'000);
+  EXPECT_LT(capacities.likely(key, 500'000), 6'000'000);
+  EXPECT_GT(capacities.likely(key, 500'000, true), 7'500'000);
+  EXPECT_EQ(capacities.greatest(key, 500'000), 5'000'000);
+}
+
 TEST(InstanceCapacities, ForgetTheSizeThatWasLongestNotUsed) {
   InstanceCapacities capacities;
   const auto most = static_cast<int64_t>(InstanceCapacities::kMostKeys);

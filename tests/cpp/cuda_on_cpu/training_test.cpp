@@ -14,7 +14,7 @@ namespace {
 
 TEST(Kernels, NoteTheRatesOfAStepOfNoRows) {
   AdamRates<float> noted[] = {{7, 7}, {7, 7}};
-  const LazyAdamStep<float> step = {0, nullptr, nullptr, noted, {{0.25, 3}, {0.5, 4}}, 1, 0};
+  const LazyAdamStep<float> step = {0, nullptr, nullptr, noted, {{0.25, 3}, {0.5, 4}}, 1, 0, nullptr, nullptr};
   cuda::note_step(step, nullptr);
   EXPECT_EQ(noted[0].rate, 0.25f);
   EXPECT_EQ(noted[1].rate, 7) << "of one tensor";

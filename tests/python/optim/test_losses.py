@@ -187,7 +187,7 @@ def test_what_does_not_fit_is_refused(device):
     with pytest.raises(ValueError, match="its sides must be at least 11"):
         fused_ssim(image[:, :10], image[:, :10], padding="valid")
     with pytest.raises(ValueError, match="margin is 4611686018427387904; it must be 0 to"):  # twice that wraps to 0
-        torch.ops.diff_smoe_rasterization.image_loss(image.detach(), image.detach(), 0.5, 0.5, 0.0, 2 ** 62, False)
+        torch.ops.diff_smoe_rasterization.image_loss(image.detach(), image.detach(), 0.5, 0.0, 0.5, 0.0, 2 ** 62, False)
     with pytest.raises(ValueError, match="at least one pixel"):
         l1_ssim_loss(image[:0], image[:0])
 

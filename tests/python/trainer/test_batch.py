@@ -131,6 +131,7 @@ def test_a_batched_run_resumes_bit_for_bit(tiny_config, tmp_path, gate):
     assert row["num_gaussians"] != row["protocol"]["init_points"] and row["protocol"]["batch"] == 4
 
 
+@pytest.mark.skipif(not hasattr(torch.library, "register_fake"), reason="this PyTorch has no ops on the device meta")
 def test_a_gate_is_resumed_on_its_own_device(tiny_config):
     """A batch's checkpoint is read to the host. The device "meta" stands for a GPU: it has no numbers, but a place."""
     trained = LearnedGate(tiny_config, "cpu")

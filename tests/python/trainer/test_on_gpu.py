@@ -18,6 +18,7 @@ from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
 from dsmoe.system.process import SPARE_BYTES, return_spare_memory
 from dsmoe.train import Run, train
+from dsmoe.training import graphs
 from dsmoe.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
@@ -63,8 +64,47 @@ def test_a_fixed_set_of_gaussians_ends_as_good_as_on_the_cpu(tiny_config, scene,
     assert rows[1]["psnr"] == pytest.approx(rows[0]["psnr"], abs=0.1)
 
 
+def steps_of(trainer, count):
+    for _ in range(count):
+        trainer.step()
+
+
+@pytest.mark.parametrize("full", [0.8, 0.0], ids=["room", "each_replay_is_thought_to_have_filled_its_lists"])
+@pytest.mark.parametrize("options", [
+    dict(blend_mode="alpha"), dict(blend_mode="smoe", background_gate="learned", random_background=True),
+    dict(blend_mode="alpha", strategy="mcmc", budget=60),
+    dict(blend_mode="smoe", strategy="importance", budget=60, strategy_options="views=3,moves=0.2")], ids=str)
+def test_captured_steps_give_the_bits_of_launched_ones(config, scene, monkeypatch, options, full):
+    """Over densifications, moves, looks, evaluations, other losses, degrees and masks, and a break on the way."""
+    monkeypatch.setattr(graphs, "WARM_UP", 3)
+    monkeypatch.setattr(graphs, "FULL", full)
+    mask = torch.randint(0, 256, (1, 24, 32), dtype=torch.uint8)
+    views = [dataclasses.replace(view, mask=mask if index % 3 else None) for index, view in enumerate(scene.train)]
+    scene, config = dataclasses.replace(scene, train=views), config.changed(deterministic=True, **options)
+    launched, captured, broken, resumed = (Trainer(config, scene) for _ in range(4))
+    launched.passes._graphs = graphs.NoGraphs()
+    replays = []
+    monkeypatch.setattr(graphs.Captured, "replay_draw", lambda self, *arguments, real=graphs.Captured.replay_draw: (
+        replays.append(self), real(self, *arguments))[1])
+    for trainer in (launched, captured):
+        torch.manual_seed(7)
+        for step in range(40):
+            trainer.step(trainer.evaluate if step % 7 == 6 else None)
+    assert len(replays) > 10 and len(set(replays)) > 2
+    torch.manual_seed(7)
+    steps_of(broken, 21)
+    resumed.load_state_dict(broken.state_dict())
+    steps_of(resumed, 19)
+    for other in (captured, resumed):
+        for name in PARAMETERS:
+            assert torch.equal(launched.model.raw[name], other.model.raw[name]), name
+        assert launched.training_psnr() == other.training_psnr()
+        assert launched.background_gate == other.background_gate
+
+
 @pytest.mark.parametrize("options", [dict(), dict(background_gate="learned", random_background=True)])
-def test_a_step_does_not_wait_for_the_device(config, scene, options):
+def test_a_step_does_not_wait_for_the_device(config, scene, monkeypatch, options):
+    monkeypatch.setattr(graphs, "WARM_UP", 12)  # launched, captured and replayed below
     trainer = Trainer(dataclasses.replace(config, densify_until_iter=0, **options), scene)
     for _ in range(8):
         trainer.step()  # every view once: cameras are sent, memory is taken

@@ -1,12 +1,15 @@
 """The direct passes of a step against those of autograd: the same training, bit for bit, whatever happens in it."""
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
 from dsmoe.model import PARAMETERS
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
+from dsmoe.training.graphs import Graphs
 from dsmoe.training.passes import AutogradPasses, DirectPasses
 from dsmoe.training.trainer import Trainer
 
@@ -16,15 +19,31 @@ def scene(tiny_config):
     return load_scene(tiny_config, progress=False)
 
 
-def make_direct(trainer):
+class Repeats(Graphs):
+    """Graphs that run their functions anew at each replay, and count these."""
+
+    def __init__(self):
+        super().__init__()
+        self.replays = 0
+
+    def _record(self, function):
+        def replay():
+            self.replays += 1
+            function()
+
+        return replay
+
+
+def make_direct(trainer, graphs=None):
     """On the CPU it is not by itself."""
-    trainer.passes = DirectPasses(trainer.model, trainer.optimizer, trainer.renderer, trainer.gate)
+    trainer.passes = DirectPasses(trainer.model, trainer.optimizer, trainer.renderer, trainer.gate,
+                                  lambda iteration: trainer.strategy.loss_rule(iteration), graphs)
 
 
-def trained(config, scene, direct, steps=40):
+def trained(config, scene, direct, steps=40, graphs=None):
     trainer = Trainer(config, scene)
     if direct:
-        make_direct(trainer)
+        make_direct(trainer, graphs)
     for _ in range(steps):
         trainer.step()
     return trainer
@@ -56,6 +75,33 @@ def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
     trainers = [trained(config, scene, direct) for direct in (False, True)]
     assert [type(trainer.passes) for trainer in trainers] == [AutogradPasses, DirectPasses]
     assert trainers[1].model.num_gaussians != len(scene.points.positions), "something must have been densified"
+    assert_equal(*trainers)
+
+
+@pytest.mark.parametrize("options", [
+    dict(blend_mode="alpha"), dict(blend_mode="smoe", background_gate="learned", random_background=True),
+    dict(blend_mode="alpha", strategy="mcmc", budget=60),
+    dict(blend_mode="smoe", strategy="importance", budget=60, strategy_options="views=3,moves=0.2")], ids=str)
+@pytest.mark.parametrize("masked", [False, True])
+def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypatch, options, masked):
+    """Whatever comes between: densifications, looks, evaluations, other losses, degrees and backgrounds."""
+    monkeypatch.setattr("dsmoe.training.graphs.WARM_UP", 3)
+    monkeypatch.setattr("diff_smoe_rasterization.lazy_adam._CAPACITY", 7)
+    if masked:
+        mask = torch.randint(0, 256, (1, 24, 32), dtype=torch.uint8)
+        views = [dataclasses.replace(view, mask=mask if index % 3 else None) for index, view in enumerate(scene.train)]
+        scene = dataclasses.replace(scene, train=views)
+    config = tiny_config.changed(**options)
+    repeats = Repeats()
+    trainers, reports = [trained(config, scene, True, 0, graphs) for graphs in (None, repeats)], []
+    for trainer in trainers:
+        torch.manual_seed(5)
+        reports.append([])
+        for step in range(40):
+            trainer.step(trainer.evaluate if step % 7 == 6 else None)
+            reports[-1].append((float(trainer.training_psnr()), trainer.num_gaussians))
+    assert repeats.replays > 30
+    assert reports[0] == reports[1]
     assert_equal(*trainers)
 
 
