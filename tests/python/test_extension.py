@@ -373,11 +373,15 @@ def every_call():
                            "root_scales": [1.0] * 4, "radii": radii},
         "gaussian_adam": {"raw": alike(), "values": alike(raw[1:]), "dL_dvalues": alike(), **adam, "radii": radii},
         "gather_rows": {"tensors": raw, "rows": torch.arange(3)},
-        "image_loss": {"image": image, "target": image, "l1_weight": 0.8, "ssim_weight": -0.2, "offset": 0.2,
-                       "margin": 0, "with_gradient": True},
+        "image_loss": {"image": image, "target": image, "l1_weight": 0.8, "l2_weight": 0.0, "ssim_weight": -0.2,
+                       "offset": 0.2, "margin": 0, "with_gradient": True},
         "activate": dict(zip(("opacities", "scales", "rotations"), raw[1:])),
         "activate_backward": {"raw": raw[1:], "values": values,
                               **dict(zip(("dL_dopacities", "dL_dscales", "dL_drotations"), alike(raw[1:])))},
+        "gate_adam": {**dict(zip(("logarithm", "moment", "square", "gate", "gradient"), alike([torch.ones(1)] * 5))),
+                      "rate": 0.03, "root_scale": 1.0, "beta1": 0.9, "beta2": 0.999, "epsilon": 1e-8, "bound": 0.0,
+                      "limit": 60.0},
+        "set_inputs": {"to": alike(), "source": alike(), "numbers": torch.zeros(2), "new_numbers": [1.0, 2.0]},
         "add_view": {"dL_dmeans2D": raw[0], "radii": radii, "gradient_sum": depth, "view_count": depth.clone()},
         "mean_squared_neighbour_distances": {"points": raw[0]}}
     calls = {}

@@ -41,7 +41,8 @@ def test_the_models_record_their_modes(output):
     for mode in ("alpha", "smoe"):
         model = read_gaussians(str(output / f"{mode}.ply"))
         assert model.blend_mode == mode
-        assert model.background_gate is None if mode == "alpha" else 0.05 < model.background_gate < 0.2
+        # Learned from 0.1: 30 steps of Adam change its logarithm by at most 30 times the rate, 0.03.
+        assert model.background_gate is None if mode == "alpha" else 0.04 < model.background_gate < 0.25
 
 
 def test_pictures_show_truth_and_both_modes(output):
