@@ -210,6 +210,9 @@ class CudaGraphs(Graphs):
                 graph.capture_begin(pool=self._pool)
             try:
                 function()
-            finally:
-                graph.capture_end()
+            except BaseException:  # it says what is wrong; the end of a broken capture would say less
+                with contextlib.suppress(RuntimeError):
+                    graph.capture_end()
+                raise
+            graph.capture_end()
         return graph

@@ -5,7 +5,7 @@ import pytest
 import torch
 from devices import random_normal
 
-import diff_smoe_rasterization.optimizers  # noqa: F401  (loading it registers the ops)
+from diff_smoe_rasterization import FusedAdam
 from diff_smoe_rasterization.gaussians import activate, add_view, divided
 from diff_smoe_rasterization.neighbors import distCUDA2
 
@@ -141,6 +141,59 @@ def test_what_does_not_fit_is_refused(device):
         add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int64), torch.zeros(4), torch.zeros(4))
     with pytest.raises(ValueError, match=r"add_view: view_count has shape \[5\]; it must be \[4\]"):
         add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int32), torch.zeros(4), torch.zeros(5))
+
+
+set_inputs = torch.ops.diff_smoe_rasterization.set_inputs
+
+
+def test_inputs_of_a_step_are_copied_and_written(device):
+    """Bytes that fill no whole piece of 16, places where none may begin, an empty tensor, and a number alone."""
+    bytes_ = (random_normal((3, 7, 11), 0).abs() * 80).to(torch.uint8)
+    source = [bytes_, bytes_.flatten()[3:60], random_normal((4, 4), 1), random_normal((5,), 2).double(),
+              torch.zeros(0), (random_normal((9,), 3) * 50).int()]
+    room = torch.zeros(100, dtype=torch.uint8)
+    to = [torch.zeros_like(source[0]), room[5:62], *(torch.zeros_like(tensor) for tensor in source[2:])]
+    numbers = torch.zeros(6)
+    set_inputs(to, source, numbers[1:4], [0.5, 4095.0, 1 / 3])
+    assert all(torch.equal(copy, tensor) for copy, tensor in zip(to, source))
+    assert torch.equal(numbers, torch.tensor([0, 0.5, 4095, 1 / 3, 0, 0]))
+    assert not room[:5].any() and not room[62:].any()
+    set_inputs([], [], numbers[:1], [7.0])
+    assert numbers[0] == 7 and numbers[1] == 0.5
+
+
+@pytest.mark.parametrize("to, source, new, error, text", [
+    ([torch.zeros(3)], [], [], ValueError, "source has length 0; it must be 1"),
+    ([torch.zeros(3)], [torch.zeros(4)], [], ValueError, r"to\[0\] has shape \[3\]; it must be \[4\]"),
+    ([torch.zeros(3)], [torch.zeros(3).double()], [], TypeError, r"to\[0\] is float32; it must be float64"),
+    ([torch.zeros(3).bool()], [torch.zeros(3).bool()], [], TypeError, r"source\[0\] is bool; it must be uint8"),
+    ([torch.zeros(1)] * 9, [torch.zeros(1)] * 9, [], ValueError, "to has length 9; it must be at most 8"),
+    ([], [], [1.0] * 33, ValueError, "new_numbers has length 33; it must be at most 32"),
+    ([], [], [1.0], ValueError, r"numbers has shape \[0\]; it must be \[1\]")])
+def test_inputs_that_do_not_fit_are_refused(to, source, new, error, text):
+    with pytest.raises(error, match="set_inputs: " + text):
+        set_inputs(to, source, torch.zeros(0), new)
+
+
+def test_a_step_of_the_gate_is_one_of_adam_on_its_logarithm(device):
+    bound, limit = 0.25, 1.0
+    logarithm, gate, moment, square = torch.full((1,), -0.5), torch.zeros(1), torch.zeros(1), torch.zeros(1)
+    p = logarithm.double().requires_grad_()
+    adam = FusedAdam([p], lr=0.3)
+    for step in range(1, 9):
+        gradient = torch.full((1,), -0.5 - step / 4)
+        (gradient.double() * (bound + p.exp())).sum().backward()
+        adam.step()
+        adam.zero_grad()
+        with torch.no_grad():
+            p.clamp_(-limit, limit)
+        torch.ops.diff_smoe_rasterization.gate_adam(
+            logarithm, moment, square, gate, gradient, 0.3 / (1 - 0.9**step), (1 - 0.999**step) ** -0.5, 0.9, 0.999,
+            1e-8, bound, limit)
+        # A few roundings in each of the steps.
+        torch.testing.assert_close(logarithm.double(), p.detach(), rtol=0, atol=1e-5)
+        torch.testing.assert_close(gate.double(), bound + p.detach().exp(), rtol=1e-5, atol=0)
+    assert float(logarithm) == limit, "it has come to its bound"
 
 
 gather_rows = torch.ops.diff_smoe_rasterization.gather_rows
