@@ -5,6 +5,7 @@ so its links work as they are; a link to a folder leads to its README.md, or to 
 """
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -20,6 +21,7 @@ IO = ROOT / "diff_smoe_rasterization" / "csrc" / "io"
 
 # The headers in the order in which one reads them; others follow by name.
 FIRST = ("rasterize.h", "rasterize_cuda.h", "params.h", "allocator.h", "torch.h")
+DEMO = "DSMOE_DEMO"  # names the page of `dsmoe export` that the site shows; the repository holds no model
 IO_HEADERS = ("ply.h", "point_cloud.h", "colmap.h")
 
 
@@ -40,6 +42,11 @@ def main(folder: Path) -> None:
                 copy(path, pages)
         write(pages / page.relative_to(ROOT), text)
     write(pages / "docs" / "site" / "cpp_headers.md", header_pages())
+    if os.environ.get(DEMO):
+        shutil.copyfile(os.environ[DEMO], pages / "docs" / "demo.html")
+        look = pages / "docs" / "look.md"
+        look.write_text(look.read_text(encoding="utf-8").replace(
+            "# Looking at a model\n", "# Looking at a model\n\n[A model to look at here](demo.html).\n"), encoding="utf-8")
     settings = (SITE / "mkdocs.yml").read_text(encoding="utf-8")
     write(folder / "mkdocs.yml", settings.replace("REPOSITORY", str(ROOT)))
 

@@ -66,6 +66,15 @@ def test_the_page_of_headers_has_declarations_and_no_bodies(stage):
         assert shown.count("{") == shown.count("}") and "  return " not in shown and "for (" not in shown, path.name
 
 
+def test_the_site_shows_the_page_that_is_named(stage, tmp_path, monkeypatch):
+    (tmp_path / "model.html").write_text("<p>a model</p>", encoding="utf-8")
+    monkeypatch.setenv(stage.DEMO, str(tmp_path / "model.html"))
+    stage.main(tmp_path / "site")
+    docs = tmp_path / "site" / "pages" / "docs"
+    assert (docs / "demo.html").read_text(encoding="utf-8") == "<p>a model</p>"
+    assert "](demo.html)" in (docs / "look.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(stage, tmp_path):
     for name in ("mkdocs", "material", "mkdocstrings", "ruff"):

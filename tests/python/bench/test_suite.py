@@ -1,10 +1,13 @@
 """Suites: what they expand to, and which mistakes are refused with the name of the field."""
+import json
 import re
 from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+import real_data
 import yaml
+from PIL import Image
 
 from dsmoe import bench
 from dsmoe.bench import engine, schema
@@ -13,6 +16,7 @@ from dsmoe.bench.expansion import expand, find_suite, load_suite, read_yaml
 from dsmoe.bench.names import AXIS_OF, SHIPPED
 from dsmoe.bench.protocol import config_of
 from dsmoe.bench.schema import THRESHOLDS
+from dsmoe.cli import main
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 
@@ -231,6 +235,44 @@ def test_shipped_suites_are_valid(name, somewhere):
     if name == "fig4":
         assert {cell["densify_grad_threshold"] for cell in suite.cells} == set(THRESHOLDS)
         assert len({cell["scene"]["name"] for cell in suite.cells}) == 13
+
+
+NINE = "bicycle bonsai counter flowers garden kitchen room stump treehill".split()
+
+
+def test_mip_nerf_360_is_nine_scenes_with_both_blends_by_the_recipe_and_by_budgets(somewhere):
+    cells = load_suite(find_suite("mip-nerf-360")).cells
+    assert sorted({cell["scene"]["name"] for cell in cells}) == NINE
+    for name in NINE:
+        mine = [cell for cell in cells if cell["scene"]["name"] == name]
+        indoors = name in ("bonsai", "counter", "kitchen", "room")
+        assert {cell["scene"]["images"] for cell in mine} == {"images_2" if indoors else "images_4"}
+        assert sorted((cell["blend_mode"], cell["strategy"], cell.get("budget", 0)) for cell in mine) == [
+            (blend, *how) for blend in ("alpha", "smoe")
+            for how in (("3dgs", 0), ("importance", 100_000), ("importance", 500_000))]
+
+
+@pytest.mark.slow  # a minute and a half
+def test_mip_nerf_360_runs_on_bonsai(tmp_path, monkeypatch):
+    """A few steps on the CPU; the suite as it is shipped is for a GPU. The scene lies as its data set is unpacked."""
+    bonsai, scene = Path(real_data.folder("bonsai")), tmp_path / "360_v2" / "bonsai"
+    (scene / "images_2").mkdir(parents=True)
+    (scene / "sparse").symlink_to(bonsai / "sparse")
+    for path in (bonsai / "images").iterdir():
+        with Image.open(path) as image:
+            image.reduce(8).save(scene / "images_2" / path.name)
+    monkeypatch.setenv("DSMOE_SCENES", str(tmp_path))
+    text = Path(find_suite("mip-nerf-360")).read_text(encoding="utf-8")
+    for old, new in (("iterations: 30000", "iterations: 12"), ("device: cuda", "device: cpu\n  scale_recipe: true"),
+                     ("lpips: [lpips_vgg_inria, lpips_alex]", "lpips: []")):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "suite.yaml").write_text(text, encoding="utf-8")
+    assert main(["bench", "run", str(tmp_path / "suite.yaml"), "-o", str(tmp_path / "out"), "--only",
+                 "scene=bonsai"]) == 0
+    rows = [json.loads(line) for line in (tmp_path / "out" / "rows.jsonl").read_text().splitlines()]
+    assert len(rows) == 6 and all(row["ok"] and row["psnr"] > 10 for row in rows)
+    assert {row["num_gaussians"] for row in rows if row.get("budget") == 100_000} == {100_000}
 
 
 def test_the_suite_of_the_readme_is_valid(somewhere):
