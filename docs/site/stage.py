@@ -45,8 +45,8 @@ def main(folder: Path) -> None:
     if os.environ.get(DEMO):
         shutil.copyfile(os.environ[DEMO], pages / "docs" / "demo.html")
         look = pages / "docs" / "look.md"
-        look.write_text(look.read_text(encoding="utf-8").replace(
-            "# Looking at a model\n", "# Looking at a model\n\n[A model to look at here](demo.html).\n"), encoding="utf-8")
+        title, text = look.read_text(encoding="utf-8").split("\n", 1)
+        look.write_text(f"{title}\n\n[A model to look at here](demo.html).\n{text}", encoding="utf-8")
     settings = (SITE / "mkdocs.yml").read_text(encoding="utf-8")
     write(folder / "mkdocs.yml", settings.replace("REPOSITORY", str(ROOT)))
 
