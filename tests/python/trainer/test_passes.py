@@ -94,6 +94,8 @@ def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypa
     config = tiny_config.changed(**options)
     repeats = Repeats()
     trainers, reports = [trained(config, scene, True, 0, graphs) for graphs in (None, repeats)], []
+    if config.strategy != "mcmc":  # whose regulariser the two kinds of passes round otherwise
+        trainers.append(trained(config, scene, False, 0))
     for trainer in trainers:
         torch.manual_seed(5)
         reports.append([])
@@ -101,8 +103,9 @@ def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypa
             trainer.step(trainer.evaluate if step % 7 == 6 else None)
             reports[-1].append((float(trainer.training_psnr()), trainer.num_gaussians))
     assert repeats.replays > 30
-    assert reports[0] == reports[1]
-    assert_equal(*trainers)
+    assert all(report == reports[0] for report in reports)
+    for other in trainers[1:]:
+        assert_equal(trainers[0], other)
 
 
 def test_who_reads_the_model_finds_it_up_to_date(tiny_config, scene):
