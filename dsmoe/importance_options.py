@@ -33,7 +33,7 @@ class ImportanceOptions:
     # What fewer than so many training views need is removed and moved first; 0: only what costs least.
     needs: int = _setting(3, lambda x: x >= 0, "at least 0")
     # Nearer to a camera than this part of the distance from where its points begin nothing stays; 0: anything may.
-    near: float = _setting(0.3, lambda x: 0 <= x <= 1, "between 0 and 1")
+    near: float = _setting(0.5, lambda x: 0 <= x <= 1, "between 0 and 1")
     # Behind the moves all learning rates but the positions' fall to this part of themselves.
     anneal: float = _setting(1.0, lambda x: x > 0, "above 0")
     # There too the loss has so many times the squared error in place of the absolute one; 0: it keeps that one. With 30

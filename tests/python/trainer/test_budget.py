@@ -256,12 +256,12 @@ def test_removal_first_takes_what_two_views_or_fewer_need(tiny_config):
 
 
 def floating(trainer, rows):
-    """Puts Gaussians a little nearer to a camera each than 0.3 of the distance behind which its points begin, and one
-    a little farther away. Returns that one."""
+    """Puts Gaussians a little nearer to a camera each than half the distance behind which its points begin, and
+    one a little farther away. Returns that one."""
     raw, views = trainer.model.raw, trainer.scene.train
     points = raw["means3D"].detach().clone()
     with torch.no_grad():
-        for index, (row, part) in enumerate(zip([*rows, 0], [0.29] * len(rows) + [0.32])):
+        for index, (row, part) in enumerate(zip([*rows, 0], [0.49] * len(rows) + [0.52])):
             center = torch.tensor(views[index % len(views)].camera.center, dtype=torch.float32)
             distances, order = (points - center).norm(dim=1).sort()
             begins = distances[max(1, len(points) // 100) - 1]
