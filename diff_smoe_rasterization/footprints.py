@@ -16,6 +16,7 @@ import torch
 from .arguments import as_rendering, op_arguments, op_options, tensor_checks
 from .autograd import INPUTS, OPTIONS, once_differentiable, refuse_transforms
 from .core import _core
+from .learned_gate import gate_of
 from .settings import BLEND_MODES, GaussianRasterizationSettings, Rendering, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -101,6 +102,7 @@ def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSe
     """The tensors and the options of the op `blend`, all but the last option. Raises as `blend_footprints` does."""
     blend_mode, gate = resolve_blend(settings)
     required, _ = tensor_checks("blend_footprints", "gates", footprints.gates)
+    gate = gate_of(gate, blend_mode, (footprints.gates, footprints.features))
     learned = isinstance(gate, torch.Tensor)
     tensors = [footprints.gates, required("features", footprints.features), required("radii", footprints.radii),
                required("bg", settings.bg), required("background_gate", gate) if learned else None]

@@ -83,11 +83,12 @@ def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings
     no gradient. The arguments are those of `rasterize` that a radius depends on; errors are as there.
     """
     tensor_checks("visible_radii", "means3D", means3D)
-    # A radius depends neither on the opacity nor on the colour.
-    inputs, options = op_arguments("visible_radii", settings._replace(bg=means3D.new_zeros(1)), (), means3D,
-                                   means3D.new_zeros(len(means3D)), colors_precomp=means3D.new_zeros(len(means3D), 1),
-                                   scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
     with torch.no_grad():
+        # A radius depends neither on the opacity nor on the colour.
+        inputs, options = op_arguments("visible_radii", settings._replace(bg=means3D.new_zeros(1)), (), means3D,
+                                       means3D.new_zeros(len(means3D)),
+                                       colors_precomp=means3D.new_zeros(len(means3D), 1),
+                                       scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
         return torch.ops.diff_smoe_rasterization.radii(*inputs, *options, False)
 
 

@@ -206,6 +206,8 @@ def importance(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussia
 def mode_and_gate(settings):
     """Returns the blend mode and the background's gate lambda, a number or a tensor of shape []."""
     mode, gate = resolve_blend(settings)
+    if isinstance(gate, str):
+        raise ValueError(f"reference: background_gate is {gate!r}; it must be a number or a tensor of one element")
     return mode, gate.reshape(()) if isinstance(gate, torch.Tensor) else gate
 
 

@@ -48,10 +48,12 @@ _FAINT_BELOW = {"smoe": 0.25}
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
+LEARNED = "learned"
+"""The background gate that this process learns, one for all its renderings (learned_gate.py)."""
 MAX_BACKGROUND_GATE = 1e30  # that and a background's colour still make a float32 number
 
-BackgroundGate = Union[float, "torch.Tensor"]
-"""lambda: a number, or a tensor of one element, which receives a gradient.
+BackgroundGate = Union[float, str, "torch.Tensor"]
+"""lambda: a number, a tensor of one element, which receives a gradient, or LEARNED.
 
 In `smoe_eq7` the number 1 is alpha blending bit for bit. A tensor of 1 keeps the footprints of `smoe_eq7`, and pixels
 differ where tiles end.
@@ -86,7 +88,7 @@ class GaussianRasterizationSettings(NamedTuple):
     # level.
     deterministic: bool = False
     clamp_color: bool = True  # colours from shs are at least 0; False: as the harmonics give them, with their gradient
-    # `smoe` and `smoe_eq7`: the background's weight, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0
+    # `smoe` and `smoe_eq7`: the background's weight, 0 or more, or "learned"; None: $DSMOE_BACKGROUND_GATE, else 0
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
     # `smoe` and `smoe_eq7`: faint pairs and tails count in pixels whose near pairs have a gate sum below this. 2: in
@@ -166,8 +168,8 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 
     In `smoe` and `smoe_eq7` an explicit value wins; None means the environment variable DSMOE_BACKGROUND_GATE, for
     callers that cannot be edited, and 0 where that is unset. `alpha` has the gate 1; the ablations have none.
-    Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor of not one element, and
-    for a value in a mode that knows none.
+    LEARNED stays that word. Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor
+    of not one element, another word, and for a value in a mode that knows none.
     """
     fixed = _FIXED_GATES.get(blend_mode, 0.0)
     if fixed is not None:
@@ -183,7 +185,9 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
         if tensor.numel() != 1:
             raise ValueError(f"background_gate has shape {list(tensor.shape)}; it must have one element")
         return background_gate
-    return _weight(source, background_gate)
+    if isinstance(background_gate, str) and background_gate == LEARNED:
+        return LEARNED
+    return _weight(source, background_gate, other=f", or {LEARNED!r}")
 
 
 def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
@@ -225,7 +229,7 @@ def _is_tensor(value: Any) -> bool:
 
 
 # The blend mode and gate of the training that this process is, ahead of the variables: a patched trainer sets it.
-blend_of_process: Optional[Tuple[str, Optional[float]]] = None
+blend_of_process: Optional[Tuple[str, Optional[Union[float, str]]]] = None
 
 
 def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, BackgroundGate]:
@@ -241,11 +245,14 @@ def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, Backgro
     return "alpha" if mode == "smoe_eq7" and not _is_tensor(gate) and gate == 1 else mode, gate
 
 
-def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:
-    """Returns the background's gate that a training takes and records; None in modes that know none.
+def training_background_gate(blend_mode: str, background_gate: Union[float, str, None] = None
+                             ) -> Union[float, str, None]:
+    """Returns the background's gate that a public trainer takes and records; None in modes that know none.
 
-    In GATED_MODES that is the given value, else the environment variable DSMOE_BACKGROUND_GATE, else 0.
-    Raises ValueError as `resolve_background_gate` does.
+    In GATED_MODES that is the given value, else the environment variable DSMOE_BACKGROUND_GATE, else LEARNED in `smoe`
+    and 0 in `smoe_eq7`. Raises ValueError as `resolve_background_gate` does.
     """
+    if background_gate is None and blend_mode == "smoe" and not os.environ.get(BACKGROUND_GATE_VARIABLE):
+        return LEARNED
     gate = resolve_background_gate(blend_mode, background_gate)
-    return cast(float, gate) if blend_mode in GATED_MODES else None
+    return cast("Union[float, str]", gate) if blend_mode in GATED_MODES else None

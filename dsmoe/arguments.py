@@ -149,9 +149,9 @@ def build_parser() -> argparse.ArgumentParser:
                                           "written into the checkout; what the command starts has the rasterizer too.")
     run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
-    run.add_argument("--background-gate", "--background_gate", type=float, metavar="V",
-                     help="in smoe, how much the background weighs; 0 is the paper's Eq. 7 (default: "
-                          "$DSMOE_BACKGROUND_GATE, else 0); nothing records it either")
+    run.add_argument("--background-gate", "--background_gate", metavar="V",
+                     help="how much the background weighs: a number, 0 in the paper, or `learned` (default: "
+                          "$DSMOE_BACKGROUND_GATE, else learned in smoe, 0 in smoe_eq7); models record it")
     run.add_argument("--trainer", metavar="NAME",
                      help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
                           "(inria, inria_2024, scaffold, ...); default: found out from the script's folder")

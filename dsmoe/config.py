@@ -12,6 +12,7 @@ from diff_smoe_rasterization.settings import (
     BACKGROUND_GATE_VARIABLE,
     BLEND_MODES,
     GATED_MODES,
+    LEARNED,
     MAX_BACKGROUND_GATE,
     resolve_background_gate,
     resolve_blend_mode,
@@ -30,7 +31,6 @@ PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
 DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
-LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
           "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
@@ -367,7 +367,7 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     if blend_mode not in GATED_MODES:
         fixed = float(resolve_background_gate(blend_mode, None))
         return fixed if asked in (None, fixed) else float(resolve_background_gate(blend_mode, asked))
-    if asked == LEARNED or asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
+    if (os.environ.get(BACKGROUND_GATE_VARIABLE) or LEARNED if asked is None else asked) == LEARNED:
         return LEARNED
     return float(resolve_background_gate(blend_mode, asked))
 

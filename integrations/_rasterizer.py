@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 import diff_smoe_rasterization
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
+from diff_smoe_rasterization.learned_gate import gate_of
 from diff_smoe_rasterization.settings import resolve_blend
 
 from ._walk import median_of, weights_of
@@ -51,6 +52,7 @@ def share_of_gaussians(alpha: torch.Tensor, settings: Settings) -> torch.Tensor:
     mode, gate = resolve_blend(settings)
     if mode in ("alpha", "smoe"):
         return alpha
+    gate = gate_of(gate, mode, (alpha,))
     gate_sum = alpha
     if not isinstance(gate, torch.Tensor) and gate == 0:
         return (gate_sum > 0).to(gate_sum.dtype)

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Dict, List, NoReturn, Optional, Sequence, Set, Tuple
+from typing import Dict, List, NoReturn, Optional, Sequence, Set, Tuple, Union
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
@@ -29,7 +29,7 @@ FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
-        background_gate: Optional[float] = None) -> NoReturn:
+        background_gate: Union[float, str, None] = None) -> NoReturn:
     """Runs the command, and ends with its exit status, or 128 + N where signal N ended it.
 
     Where this process is killed, the command gets a SIGTERM. Raises PatchError where the command would not run, or did
@@ -61,7 +61,8 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
 
 
 def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
-            environment: Dict[str, str], background_gate: Optional[float] = None) -> Tuple[Dict[str, str], List[str]]:
+            environment: Dict[str, str], background_gate: Union[float, str, None] = None
+            ) -> Tuple[Dict[str, str], List[str]]:
     """Returns the environment of the command, and what the user is told about it."""
     try:
         gate = training_background_gate(blend_mode, background_gate)

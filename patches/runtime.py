@@ -14,9 +14,11 @@ from typing import Any, Callable, Dict, Optional, Tuple
 
 from diff_smoe_rasterization import settings
 from diff_smoe_rasterization.settings import (
+    BACKGROUND_GATE_VARIABLE,
     BLEND_MODE_VARIABLE,
     BLEND_MODES,
     GATED_MODES,
+    LEARNED,
     resolve_blend_mode,
 )
 
@@ -28,8 +30,20 @@ WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
 
 
+def keep_records() -> None:
+    """Lets the trainer's files record mode and gate, as records.py says."""
+    from diff_smoe_rasterization.integrations.records import keep
+    keep()
+
+
+def _begin_gate(frozen: bool) -> None:
+    from diff_smoe_rasterization.learned_gate import gate
+    gate.reset(frozen)
+
+
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate: that of the mode."""
+    keep_records()
     _check_renderer()  # where only it was restored, the option would be recorded and ignored
     return resolve_blend_mode(None), ""
 
@@ -40,19 +54,19 @@ def default_smoe() -> Tuple[str, str]:
     return (mode if os.environ.get(BLEND_MODE_VARIABLE) else "smoe"), gate
 
 
-def smoe_of(dataset: Any) -> Dict[str, Any]:
+def smoe_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
     """Returns what `blend_of` does for the trainer of the paper's authors, whose rasterizer is one of `smoe`.
 
     In `smoe` tails count in every pixel, as in their program. A model without a recorded mode is of that program.
     """
-    blend = blend_of(dataset, unrecorded="smoe")
+    blend = blend_of(dataset, of_saved, unrecorded="smoe")
     return {**blend, "faint_below": FAINT_EVERYWHERE} if blend["blend_mode"] == "smoe" else blend
 
 
 def saved_smoe_of(dataset: Any) -> Dict[str, Any]:
     """Returns what `smoe_of` does, for a function that renders a trained model, as `saved_blend_of`."""
     _take_saved(dataset)
-    return smoe_of(dataset)
+    return smoe_of(dataset, of_saved=True)
 
 
 def saved_blend_of(dataset: Any) -> Dict[str, Any]:
@@ -61,7 +75,7 @@ def saved_blend_of(dataset: Any) -> Dict[str, Any]:
     What is not typed as an option is what the model's cfg_args records, whatever default `dataset` brought.
     """
     _take_saved(dataset)
-    return blend_of(dataset)
+    return blend_of(dataset, of_saved=True)
 
 
 def _take_saved(dataset: Any) -> None:
@@ -72,8 +86,10 @@ def _take_saved(dataset: Any) -> None:
             setattr(dataset, option, saved.get(option))
 
 
-def blend_of(dataset: Any, unrecorded: str = "alpha") -> Dict[str, Any]:
+def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") -> Dict[str, Any]:
     """Returns the settings `blend_mode` and `background_gate` of a run (None but in GATED_MODES).
+
+    A gate that is learned begins anew; under `of_saved` it is that of the model's file, and is never stepped.
 
     Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args.
     Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a
@@ -99,8 +115,15 @@ def blend_of(dataset: Any, unrecorded: str = "alpha") -> Dict[str, Any]:
         _warn("this model's cfg_args records no background gate, so it is 0 (a model trained by `dsmoe run`, "
               "or in another mode); --background_gate says otherwise")
         gate = 0.0
-    is_of_smoe = mode not in GATED_MODES and not isinstance(gate, str)
-    gate = settings.training_background_gate(mode, None if gate == "" or is_of_smoe else gate)
+    is_of_smoe = mode not in GATED_MODES and (
+        not isinstance(gate, str) or gate == LEARNED == saved.get("background_gate"))
+    asked = None if gate == "" or is_of_smoe else gate
+    if unrecorded == "smoe" and asked is None and mode in GATED_MODES:
+        asked = os.environ.get(BACKGROUND_GATE_VARIABLE) or 0.0
+    gate = settings.training_background_gate(mode, asked)
+    keep_records()
+    if gate == LEARNED:
+        _begin_gate(frozen=of_saved)
     say(f"blend mode {mode}" + (f", background gate {gate}" if gate is not None else ""))
     # Rendering without an option never warns: it has what cfg_args records.
     for option, value in zip(OPTIONS, (mode, gate)):
@@ -165,6 +188,9 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
         module: Any = types.SimpleNamespace(__all__=names, **dict(zip(names, classes_of(flavour, __name__))))
     else:
         module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
+    keep_records()
+    if flavour == "c3dgs":  # it compresses a trained model, whose gate stays
+        _begin_gate(frozen=True)
     GaussianRasterizer.__init__ = _noting(GaussianRasterizer.__init__)  # type: ignore[method-assign]
     _say_rasterizer(flavour)
     offered = {name: getattr(module, name) for name in module.__all__ if name != os.environ.get(WITHOUT_VARIABLE)}
@@ -197,6 +223,7 @@ def gsplat_of_run() -> None:
         for module in ("gsplat", "gsplat.rendering", "gsplat.relocation", "gsplat.strategy.ops"):
             if hasattr(sys.modules.get(module), name):
                 setattr(sys.modules[module], name, function)
+    keep_records()
     _say_rasterizer("gsplat")
 
 

@@ -55,7 +55,7 @@ TRAINERS = (
     Trainer("octree-gs", "scaffold", (*IN_ONE_FILE, rendering("render.py")), ("calls set_anchor_mask",)),
     Trainer("scaffold-gs", "scaffold", (*IN_ONE_FILE, rendering("render.py"))),
     # Compressed 3DGS (Niedermayr et al. 2024) trains no model: it compresses one, whose cfg_args brings the mode.
-    Trainer("c3dgs", "c3dgs", (Entry("compress.py", "run_vq", "model_params", "pipeline_params"),
+    Trainer("c3dgs", "c3dgs", (Entry("compress.py", "run_vq", "model_params", "pipeline_params", "saved_blend_of"),
                                rendering("render.py"))),
     # Taming 3DGS (Mallick et al. 2024) scores by renderings through the pipeline that `training` was given.
     Trainer("taming", "taming", USUAL),

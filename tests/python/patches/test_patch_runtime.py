@@ -40,11 +40,12 @@ def test_the_default_is_alpha_or_the_variable(monkeypatch):
 @pytest.mark.parametrize("mode", BLEND_MODES)
 @pytest.mark.parametrize("variable", [None, "0.25"])
 def test_the_blend_of_a_run(mode, variable, monkeypatch):
-    """In GATED_MODES the gate is 0 or the variable's; no other mode has one, whatever that says."""
+    """In GATED_MODES the gate is the mode's or the variable's; no other mode has one, whatever that says."""
     if variable:
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
-    gate = float(variable or 0) if mode in GATED_MODES else None
-    for dataset in (run(mode, white_background=False), run(mode, 0.25 if variable else 0.0)):
+    own = "learned" if mode == "smoe" else 0.0
+    gate = (float(variable) if variable else own) if mode in GATED_MODES else None
+    for dataset in (run(mode, white_background=False), run(mode, gate if mode in GATED_MODES else 0.0)):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert runtime.blend_of(dataset) == {"blend_mode": mode, "background_gate": gate}
@@ -61,7 +62,7 @@ def test_settings_that_name_no_mode_have_that_of_the_run(mode, gate, monkeypatch
     assert resolve_blend(SimpleNamespace(**nameless)) == (mode, gate)
     monkeypatch.delenv("DSMOE_BLEND_MODE")
     monkeypatch.delenv("DSMOE_BACKGROUND_GATE")  # and the next run of the process has the defaults again
-    assert runtime.default_blend()[0] == "alpha" and runtime.blend_of(run("smoe"))["background_gate"] == 0
+    assert runtime.default_blend()[0] == "alpha" and runtime.blend_of(run("smoe"))["background_gate"] == "learned"
 
 
 def test_a_gate_that_is_typed_wins(monkeypatch):
@@ -70,7 +71,9 @@ def test_a_gate_that_is_typed_wins(monkeypatch):
 
 
 @pytest.mark.parametrize("mode, gate, variable, message", [
-    ("smoe", "-1", "", "background_gate is '-1'; it must be a number, 0 or more"), ("smoe", "x", "", "'x'; it must be"),
+    ("smoe", "-1", "", "background_gate is '-1'; it must be a number, 0 or more and at most 1e.30, or 'learned'$"),
+    ("smoe", "learnt", "", "background_gate is 'learnt'; it must be a number, .*'learned'$"),
+    ("smoe", "nan", "", "'nan'; it must be"), ("alpha", "learned", "", "only 'smoe' and 'smoe_eq7' know it"),
     ("smoe", "", "y", "DSMOE_BACKGROUND_GATE is 'y'"),
     ("alpha", "0.1", "", "blend_mode is 'alpha'; only 'smoe' and 'smoe_eq7' know it"),
     ("smoe_std", "0", "", "'smoe_std'; only")])
@@ -138,7 +141,7 @@ def test_one_line_says_which_mode_it_is(capsys):
         runtime.blend_of(run("alpha"))
         runtime.blend_of(run("smoe"))
     printed = capsys.readouterr()
-    said = ["blend mode alpha\n", "blend mode smoe, background gate 0.0\n"]
+    said = ["blend mode alpha\n", "blend mode smoe, background gate learned\n"]
     assert printed.out == "" and printed.err.split("diff_smoe_rasterization: ")[1:] == said
 
 

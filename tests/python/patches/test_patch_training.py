@@ -73,13 +73,18 @@ def test_patched_and_run_train_to_the_same_bits(trained):
     assert contents(checkout) == before, "a run writes into the checkout"
     assert patched.model == plain.model and patched.out == plain.out
     assert patched.model != trained("patched", "alpha").model
-    for mode, gate in (("alpha", None), ("smoe", 0.0)):
+    for mode, gate in (("alpha", None), ("smoe", "'learned'")):
         saved = (trained("patched", mode).output / "cfg_args").read_text()
         assert f"blend_mode='{mode}'" in saved and f"background_gate={gate}" in saved
 
 
-def test_render_uses_the_saved_mode_or_the_flag(trained):
+def test_render_uses_the_saved_mode_gate_or_the_flag(trained):
     output = trained("patched", "smoe").output
+    said = re.search(r"records the background gate (\S+)\n", trained.python(
+        "render.py", "-m", output, cwd=trained.checkout("patched")).err)
+    assert float(said[1]) != pytest.approx(0.1, abs=1e-3), "the gate was not learned"
+    none = trained.rendered(output, "--background_gate", "0")
+    assert all(picture != trained.rendered(output)[name] for name, picture in none.items())
     saved, alpha = trained.rendered(output), trained.rendered(output, "--blend_mode", "alpha")
     assert len(saved) == 4 and all(saved[picture] != alpha[picture] for picture in saved)
 
@@ -87,7 +92,7 @@ def test_render_uses_the_saved_mode_or_the_flag(trained):
 @pytest.mark.slow
 def test_render_uses_the_saved_gate_or_the_flag_or_0_and_without_a_saved_mode_alpha(trained):
     output = trained("patched", "smoe").output
-    gate = r", background_gate=[0-9.]+"
+    gate = r", background_gate='learned'"
     saved, without = (trained.rendered(output, change=(gate, text), DSMOE_BACKGROUND_GATE="0.5")
                       for text in (", background_gate=0.25", ""))
     none = trained.rendered(output, "--background_gate", "0")

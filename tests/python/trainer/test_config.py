@@ -62,7 +62,9 @@ def test_background_gate_of_each_mode(monkeypatch):
     assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, 0.2, 0.2, 0.0, 0.0]
     assert parse("--blend-mode", "smoe", "--background-gate", "0.4").background_gate == 0.4
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "learned")
-    with pytest.raises(ConfigError, match="DSMOE_BACKGROUND_GATE is 'learned'"):
+    assert parse("--blend-mode", "smoe").background_gate == "learned"
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "learnt")
+    with pytest.raises(ConfigError, match="DSMOE_BACKGROUND_GATE is 'learnt'"):
         parse("--blend-mode", "smoe")
 
 

@@ -1,0 +1,167 @@
+"""The background's gate lambda as a parameter of this process, which a trainer that cannot be edited learns.
+
+`background_gate="learned"` in the settings of a rendering takes it. The gate steps with the optimizer that holds the
+centres of the Gaussians; where none holds them, as they are computed, with the first that steps after a backward pass.
+Of an optimizer that is none of torch's it learns at the next rendering, by the centres that have changed.
+"""
+from __future__ import annotations
+
+import importlib
+import math
+import weakref
+from typing import Any, Dict, Iterable, Optional, Sequence, Union
+
+import torch
+
+from . import extension  # noqa: F401  (loading it registers the ops)
+from .optimizers import corrected_rates
+from .settings import MAX_BACKGROUND_GATE
+
+START = 0.1
+RATE = 0.03  # of Adam, for the logarithm
+BETAS = (0.9, 0.999)
+EPSILON = 1e-8
+LIMIT = math.log(MAX_BACKGROUND_GATE)  # of |log lambda|: beyond it float32 would soon be 0 or infinite
+
+
+class ProcessGate:
+    """lambda = exp(p) of this process, stepped by Adam. Start and rate are those of `dsmoe train`; it has no bound."""
+
+    def __init__(self) -> None:
+        self._hook: Any = None
+        self.reset()
+
+    def reset(self, frozen: bool = False) -> None:
+        """Begins at START. frozen: it is that of a trained model, which `found` will say, and is never stepped."""
+        self.frozen = frozen
+        self.blend_mode: Optional[str] = None  # of the last rendering with this gate; None: there was none
+        self._found: Optional[float] = None  # what a file said of it, until it is stepped
+        self._adam: Dict[str, Any] = {}
+        self._learns = False  # whether a rendering had its gradient
+        self._centres: Any = None  # a weak reference to those of the last one, where they are a parameter
+        self._version = 0  # of their values then
+        self._holder: Any = None  # likewise to the optimizer that holds them
+        self._passed: Any = None  # likewise to an optimizer that stepped while the gate waited for its own
+        self._put(torch.full((1,), math.log(START)))
+
+    def _put(self, logarithm: torch.Tensor) -> None:
+        self._logarithm = logarithm
+        self._value = logarithm.exp().requires_grad_()
+        if not _HAS_HOOKS:
+            self._value.register_hook(self._step)
+
+    def value(self) -> float:
+        """Returns lambda; on a GPU the host waits for it. Raises RuntimeError where a trained model has not said it."""
+        if self._found is not None:
+            return self._found
+        if self.frozen:
+            raise RuntimeError("the model was trained with a learned background gate, and no file that was read says "
+                               "which (its .ply, .npz or checkpoint): give it as a number, --background_gate V")
+        return float(self._value.detach())
+
+    def found(self, value: float, state: Optional[Dict[str, Any]] = None) -> None:
+        """Takes the lambda of a model that was read; with the `state_dict` of its training that goes on exactly."""
+        start = value if value > 0 else START
+        state = state or {"logarithm": math.log(start), "adam": {}}
+        with torch.no_grad():
+            self._logarithm.fill_(state["logarithm"])
+            self._value.fill_(start)
+        self._adam = {name: one if name == "step" else torch.full_like(self._logarithm, one)
+                      for name, one in state["adam"].items()}
+        self._found, self._value.grad = value, None
+
+    def state_dict(self) -> Dict[str, Any]:
+        """Returns plain numbers, for a checkpoint; on a GPU the host waits for them."""
+        return {"logarithm": float(self._logarithm),
+                "adam": {name: one if name == "step" else float(one) for name, one in self._adam.items()}}
+
+    def of_rendering(self, blend_mode: str, tensors: Sequence[torch.Tensor], means3D: Optional[torch.Tensor]
+                     ) -> Union[float, torch.Tensor]:
+        """Returns the lambda of a rendering. It has a gradient where one of the tensors has one.
+
+        tensors: of the Gaussians; lambda has the type and device of the first. means3D: their centres, if known.
+        """
+        self.blend_mode, like = blend_mode, tensors[0]
+        with_gradient = not self.frozen and torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
+        if not with_gradient and (self.frozen or self._found is not None):
+            return self.value()
+        if self._logarithm.device != like.device and not self._learns:
+            self._adam = {name: one if name == "step" else one.to(like.device) for name, one in self._adam.items()}
+            self._put(self._logarithm.to(like.device))
+        if not with_gradient:
+            return self._value.detach().to(like)
+        self._begin()
+        if means3D is not None:
+            self._watch(means3D)
+        # A tensor of its own for each rendering: a step between it and its backward pass changes none of them.
+        return self._value.clone().to(like)
+
+    def _begin(self) -> None:
+        self._learns = True
+        if _HAS_HOOKS and self._hook is None:
+            self._hook = _optimizers.register_optimizer_step_post_hook(self._after_step)
+        elif not _HAS_HOOKS:
+            self._value.grad = None  # it was stepped in the backward pass
+
+    def _watch(self, means3D: torch.Tensor) -> None:
+        """Notes whose step the gate waits for.
+
+        A gradient may wait that no optimizer of torch took. Where the centres were changed in place, an optimizer of
+        another kind has stepped. Where their gradient is gone, or they are, the trainer dropped it.
+        """
+        if not means3D.is_leaf or not means3D.requires_grad:
+            self._centres = None
+            return
+        before: Any = None if self._centres is None else self._centres()
+        gradient = self._value.grad
+        if gradient is not None and before is means3D and means3D._version != self._version:
+            self._step(gradient)
+            self._value.grad = None
+        elif self._centres is not None and (before is None or before is means3D and means3D.grad is None):
+            self._value.grad = None
+        self._centres, self._version = weakref.ref(means3D), means3D._version
+
+    def _after_step(self, optimizer: Any, *_: Any) -> None:
+        gradient = self._value.grad
+        if gradient is None:
+            return
+        centres = None if self._centres is None else self._centres()
+        if centres is not None and any(one is centres for group in optimizer.param_groups for one in group["params"]):
+            self._holder = weakref.ref(optimizer)
+        holder = None if self._holder is None else self._holder()
+        # Densification may have replaced the centres by others before the step. Where their optimizer is not known, one
+        # that steps a second time is as good.
+        if self._centres is None or optimizer is holder or (
+                holder is None and self._passed is not None and self._passed() is optimizer):
+            self._step(gradient)
+            self._value.grad = self._passed = None
+        else:
+            self._passed = weakref.ref(optimizer)
+
+    @torch.no_grad()
+    def _step(self, gradient: torch.Tensor) -> None:
+        """One step. A gradient that is not finite, as of a scaled loss that overflowed, counts as 0."""
+        adam = self._adam
+        if not adam:
+            adam.update(step=0, exp_avg=torch.zeros_like(gradient), exp_avg_sq=torch.zeros_like(gradient))
+        adam["step"] = int(adam["step"]) + 1
+        finite = torch.nan_to_num(gradient, 0.0, 0.0, 0.0)
+        torch.ops.diff_smoe_rasterization.gate_adam(
+            self._logarithm, adam["exp_avg"], adam["exp_avg_sq"], self._value, finite,
+            *corrected_rates({"lr": RATE, "betas": BETAS}, adam["step"]), *BETAS, EPSILON, 0.0, LIMIT)
+        self._found = None
+
+
+_optimizers: Any = importlib.import_module("torch.optim.optimizer")
+_HAS_HOOKS = hasattr(_optimizers, "register_optimizer_step_post_hook")  # torch 2.0; before, it steps in backward passes
+
+gate = ProcessGate()
+"""The gate of `background_gate="learned"`, in every rendering of this process."""
+
+
+def gate_of(background_gate: Any, blend_mode: str, tensors: Iterable[torch.Tensor],
+            means3D: Optional[torch.Tensor] = None) -> Any:
+    """Returns what a rendering takes for a resolved background gate: itself, or for LEARNED `gate.of_rendering`."""
+    if isinstance(background_gate, str):
+        return gate.of_rendering(blend_mode, [tensor for tensor in tensors if tensor is not None], means3D)
+    return background_gate
