@@ -1,6 +1,7 @@
 """The pages for users: links, commands, the README's program, and a documentation site without a warning."""
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import os
 import re
@@ -52,6 +53,103 @@ def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
         except SystemExit:
             refused.append(f"{name}: {command}")
     assert not refused
+
+
+def settings_tables():
+    """The rows of docs/settings.md by heading: {heading: [(names, defaults, range)]}."""
+    tables, heading = {}, ""
+    for line in (ROOT / "docs" / "settings.md").read_text(encoding="utf-8").splitlines():
+        heading = line.lstrip("# ") if line.startswith("#") else heading
+        if line.startswith("| `"):
+            cells = [cell.strip() for cell in line.strip("|").split(" | ")]
+            tables.setdefault(heading, []).append([re.findall("`([^`]*)`", cell) or cell for cell in cells[:3]])
+    return tables
+
+
+def limits(said):
+    """Values that a range of the page holds, at its ends, and values just outside."""
+    if isinstance(said, list):
+        return ([True, False], []) if said == ["True", "False"] else (said, ["x"])
+    number = r"(-?[\d.e]+)"
+    patterns = ((f"{number} or more", lambda a: ([a], [a - 1])), ("above 0", lambda: ([1e-9], [0])),
+                (f"above 0 to {number}", lambda a: ([1e-9, a], [0, 2 * a])),
+                (f"{number} to {number}", lambda a, b: ([a, b], [a - 1, 2 * b + 1])),
+                (f"{number} to below {number}", lambda a, b: ([a], [a - 1, b])),
+                (f"{number}, or {number} or more", lambda a, b: ([a, b], [a - 1, b - 0.5])))
+    for pattern, ends in patterns:
+        found = re.fullmatch(pattern, said)
+        if found:
+            return ends(*map(float, found.groups()))
+    assert said == "text" or "finite" in said, said
+    return [], []
+
+
+def accepts(call, name, value, like):
+    """Whether a setting may have a value, which is made one of the type of `like`."""
+    value = int(value) if isinstance(value, float) and type(like) is int else value
+    try:
+        call(**{name: value})
+        return True
+    except ValueError:
+        return False
+
+
+def test_the_page_of_settings_says_what_the_code_does(stage):
+    from scenes import random_scene
+
+    from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize
+    from dsmoe.config import TrainConfig
+    from dsmoe.importance_options import ImportanceOptions, parse_importance_options
+
+    tables = settings_tables()
+    scene = random_scene("smoe", 5, 20, 18)
+    scene.inputs["shs"] = torch.zeros(5, 16, 3, dtype=scene.inputs["means3D"].dtype)  # of all degrees
+
+    def render(**changed):
+        rasterize(settings=scene.settings._replace(**changed), **scene.inputs)
+
+    def train(**changed):
+        budget = {"budget": 100} if changed.get("strategy") in ("importance", "mcmc") else {}  # which need one
+        return TrainConfig(**{"blend_mode": "smoe", **budget, **changed}).validate()
+
+    eq7, moved = train(blend_mode="smoe_eq7"), train(strategy="importance", budget=100)
+    usual = {field.name: field.default for field in dataclasses.fields(TrainConfig)}
+    depending = {name for name in usual if usual[name] is None} - {"blend_mode", "background_gate", "strategy"}
+    defaults = {name: [repr(getattr(train(), name)), repr(getattr(other, name))] for name in depending
+                for other in (eq7, moved) if getattr(train(), name) != getattr(other, name)}
+    importance = {field.name: field.default for field in dataclasses.fields(ImportanceOptions)}
+    for heading, names, default_of, like, call in (
+            ("A rendering", GaussianRasterizationSettings._fields,
+             lambda name: [repr(GaussianRasterizationSettings._field_defaults[name])]
+             if name in GaussianRasterizationSettings._field_defaults else "none", scene.settings._asdict(), render),
+            ("A training", list(usual), lambda name: defaults.get(name) or ("none" if usual[name] == "" else [
+                usual[name] if isinstance(usual[name], str) else repr(usual[name])]), usual, train),
+            ("The strategy importance", list(importance), lambda name: [repr(importance[name])], importance,
+             lambda **given: parse_importance_options("{}={}".format(*next(iter(given.items())))))):
+        rows = tables[heading]
+        assert [name for (name,), *_ in rows] == list(names), heading
+        for (name,), default, said in rows:
+            assert default == default_of(name), f"{heading}: {name} is {default_of(name)}, and the page says {default}"
+            said = said.partition(", or `")[0] if isinstance(said, str) else said
+            inside, outside = limits("0 to 1e30" if said == ["learned"] else said)
+            for value in inside[:1] if name.startswith("image_") else inside:
+                assert accepts(call, name, value, like[name]), f"{heading}: {name} may not be {value}"
+            for value in outside:
+                assert not accepts(call, name, value, like[name]), f"{heading}: {name} may be {value}"
+
+
+def test_the_page_of_settings_has_every_variable():
+    read = set()
+    for name in ("dsmoe", "diff_smoe_rasterization", "patches", "integrations", "setup.py", "tests", "build_support",
+                 "quickstart", "check", "docs/build"):
+        for path in [ROOT / name] if (ROOT / name).is_file() else (ROOT / name).rglob("*"):
+            if path.suffix in (".py", ".cpp", ".yaml") or not path.suffix and path.is_file():
+                text = path.read_text(encoding="utf-8", errors="replace")
+                read.update(re.findall(r'(?:getenv\(|environ\.get\(|environ\[|VARIABLE = |RENAMED = |"(?:vgg|alex)": )'
+                                       r'"(DSMOE_\w+)"', text))
+                read.update(re.findall(r"\$\{?(DSMOE_\w+)", text) if path.suffix in ("", ".sh", ".yaml") else ())
+    said = {name for names, *_ in settings_tables()["The environment"] for name in names if name.startswith("DSMOE_")}
+    assert said == read - {"DSMOE_X"}
 
 
 def test_the_page_of_headers_has_declarations_and_no_bodies(stage):

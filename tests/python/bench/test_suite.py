@@ -264,7 +264,8 @@ def test_mip_nerf_360_runs_on_bonsai(tmp_path, monkeypatch):
     monkeypatch.setenv("DSMOE_SCENES", str(tmp_path))
     text = Path(find_suite("mip-nerf-360")).read_text(encoding="utf-8")
     for old, new in (("iterations: 30000", "iterations: 12"), ("device: cuda", "device: cpu\n  scale_recipe: true"),
-                     ("lpips: [lpips_vgg_inria, lpips_alex]", "lpips: []")):
+                     ("lpips: [lpips_vgg_inria, lpips_alex]", "lpips: []"),
+                     ("budgets: [100000, 500000]", "budgets: [100000, 200000]")):  # what so few steps can reach
         assert old in text
         text = text.replace(old, new)
     (tmp_path / "suite.yaml").write_text(text, encoding="utf-8")
@@ -272,7 +273,7 @@ def test_mip_nerf_360_runs_on_bonsai(tmp_path, monkeypatch):
                  "scene=bonsai"]) == 0
     rows = [json.loads(line) for line in (tmp_path / "out" / "rows.jsonl").read_text().splitlines()]
     assert len(rows) == 6 and all(row["ok"] and row["psnr"] > 10 for row in rows)
-    assert {row["num_gaussians"] for row in rows if row.get("budget") == 100_000} == {100_000}
+    assert all(row["num_gaussians"] == row["budget"] for row in rows if row.get("budget"))
 
 
 def test_the_suite_of_the_readme_is_valid(somewhere):
