@@ -138,6 +138,21 @@ def test_the_page_of_settings_says_what_the_code_does(stage):
                 assert not accepts(call, name, value, like[name]), f"{heading}: {name} may be {value}"
 
 
+def test_the_words_of_the_kernels_name_what_the_code_has(stage):
+    words = (ROOT / "docs" / "cuda.md").read_text(encoding="utf-8").partition("## Words")[2].partition("\n## ")[0]
+    assert [line.split(" | ")[0][2:] for line in words.splitlines() if line.startswith("| ")][1:] == (
+        "pair strong tail near faint covered wide footprint instance entry square quarter mark segment "
+        "capacity").split()
+    code = "\n".join(path.read_text(encoding="utf-8") for folder in (stage.INCLUDE, stage.INCLUDE.parents[1] / "csrc")
+                     for path in folder.rglob("*.*h"))
+    for name, number in (("kStrongAlpha", "1/2040"), ("kAlphaCut", "1/255"), ("kCoreAlpha", "1/1020"),
+                         ("kSegmentLength", "512")):
+        assert number in words and name in words
+        said = re.search(rf"\b{name} = ([^;]*);", code)[1].replace(".0f", "").replace(" ", "")
+        assert said == number, f"{name} is {said}"
+    assert not [name for name in re.findall(r"`(k[A-Z]\w+)`", words) if not re.search(rf"\b{name}\b", code)]
+
+
 def test_the_page_of_settings_has_every_variable():
     read = set()
     for name in ("dsmoe", "diff_smoe_rasterization", "patches", "integrations", "setup.py", "tests", "build_support",
