@@ -123,9 +123,11 @@ def test_stand_ins_only_for_what_is_missing(tmp_path, python):
 
 @pytest.mark.parametrize("mode", BLEND_MODES)
 def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
-    """That which is asked for, else the variable's, else 0; and none in modes that know none."""
+    """That which is asked for, else the variable's, else the mode's; and none in modes that know none."""
     words = [sys.executable, "show.py"]
-    for variable, asked, gate in (("", None, 0.0), ("0.25", None, 0.25), ("0.25", 0.0, 0.0)):
+    own = "learned" if mode == "smoe" else 0.0
+    for variable, asked, gate in (("", None, own), ("0.25", None, 0.25), ("0.25", 0.0, 0.0),
+                                 ("0.25", "learned", "learned")):
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
         if mode in GATED_MODES or asked is None:
             made, lines = run.prepare(words, mode, "scaffold", dict(os.environ), asked)
