@@ -7,6 +7,7 @@ numpy.savez gets a comment behind its end (a zip file's), which no other reader 
 from __future__ import annotations
 
 import functools
+import importlib
 import importlib.util
 import json
 import os
@@ -46,8 +47,7 @@ def keep() -> None:
     _wrap(numpy, "load", after=lambda loaded, file=None, *more, **named: _take(
         file, any("opacit" in name for name in getattr(loaded, "files", ()))))
     if importlib.util.find_spec("plyfile"):
-        from plyfile import PlyData  # type: ignore[import-not-found, import-untyped, unused-ignore]
-
+        PlyData = importlib.import_module("plyfile").PlyData  # the trainer has it: this package does not need it
         _wrap(PlyData, "write", before=_record_ply)
         read = PlyData.read
         PlyData.read = staticmethod(functools.wraps(read)(lambda *of, **named: _take_ply(read(*of, **named), of)))
