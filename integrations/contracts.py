@@ -22,11 +22,6 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "depth": ("[1, H, W], z blended as a colour over 0", "depth"),
     "alpha": ("[1, H, W], the share of the pixel that the background does not have", "alpha"),
     "median_depth": ("[1, H, W], z of the Gaussian where the weights, front to back, reach half a pixel", "med"),
-    "coord": ("[3, H, W], the point of plane_depth in the camera's frame", ""),
-    "median_coord": ("[3, H, W], the point of median_plane_depth there", ""),
-    "plane_depth": ("[1, H, W], the mean z of the Gaussians' planes on the pixel's ray", "depth"),
-    "median_plane_depth": ("[1, H, W], that of the Gaussian that makes the pixel half full", "depth"),
-    "normal": ("[3, H, W], of length 1, towards the camera, in its frame", ""),
     "depth_alpha": ("[2, H, W], the depth, and the share of the pixel that the background has", "depth_alpha"),
     "opacity": ("[1, H, W], the same as alpha", "opac"),
     "is_used": ("[N] int32, 1 where the radius is positive", "used"),
@@ -52,6 +47,11 @@ WORDS = (("radii", "radi"), ("median_depth", "med.*depth|depth.*med"), ("inverse
 FOREIGN = ("surf", "plan", "gof", "^rade|_rade", "omni", "pano", "spher", "fisheye", "360", "op43", "ortho", "ray",
            "2d", "4d", "mesh", "triang", "convex", "beta", "gabor", "sonar", "radar", "_rf", "event", "voxel", "normal",
            "light")
+
+REFUSED = {  # signs of rasterizers whose API is known, and why none is offered
+    "sets require_depth": "its settings have require_depth, as RaDe-GS's: its gradients of the depths and normals of "
+                          "planes, and its median of a pixel that is never half full, are not computed here",
+}
 
 
 class Contract(NamedTuple):
@@ -90,9 +90,6 @@ CONTRACTS = (
              signs=("sets clamp_color", "imports GaussianRasterizerIndexed")),
     Contract("taming", "Taming-3DGS", TAMING, ("pixel_weights",), WITH_DC, ("SparseGaussianAdam",),
              ("sets pixel_weights",)),
-    Contract("rade_gs", "RaDe-GS", ("color", "radii", "coord", "median_coord", "plane_depth", "median_plane_depth",
-                                    "alpha", "normal"), ("kernel_size", "require_depth", "require_coord"),
-             signs=("sets require_depth",), methods=("integrate",)),
     Contract("mip_splatting", "Mip-Splatting, TRELLIS", settings=("kernel_size", "subpixel_offset"),
              signs=("sets kernel_size",), absolute=1),
     Contract("monogs", "MonoGS", ("color", "radii", "depth", "opacity", "n_touched"), ("projmatrix_raw",),

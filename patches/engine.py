@@ -15,12 +15,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Set, Union
 
-from . import facts
+from . import facts, kernels
 from .rules import OPTIONS, SETTINGS, entries_in, import_rasterizer, rules_of, settings_blend, start
 from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, leftover, tree_of, unpatched
-from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
+from .trainers import GR, INTEGRATIONS, OF_AUTHORS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
 UNFINISHED = ".dsmoe_unfinished"  # begins the name of a folder of new files, until all are written
+OF_PROCESS = re.compile(re.escape(UNFINISHED) + r"\w{8}\.(\d+)")  # the whole name; the number is of its process
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
 CALLS = r"|\b(?:chosen_blend|default_(?:blend|smoe)|(?:saved_)?(?:blend|smoe)_of)\("  # nowhere imported without it
@@ -141,6 +142,9 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         chosen = None
     elif GR not in now:
         reason, chosen = f"there is no {GR} in it", None
+    blends = kernels.another_blend(root, facts.packages(found)) if known and known.name != OF_AUTHORS else ""
+    if blends and not trainer:
+        return Plan(root, "unknown", None, [f"{blends}: {facts.STILL}"], applied)
     if chosen is None or facts.those(found, "uses "):
         instead = [] if "type `dsmoe run" in reason or below else [_instead(before, found)]
         return Plan(root, "unknown", None, [reason, *instead], applied)
@@ -153,7 +157,10 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
              for name, data in now.items() if data != as_it_was[name]]
     state, reasons = (("unpatchable" if now == before else "drifted", patched.problems) if patched.problems else
                       ("patched", []) if not wrong else ("patchable", []) if now == before else ("half-patched", wrong))
+    if state == "unpatchable":
+        reasons = [*reasons, f"unpatched it may run: {_by_run(before)}"]
     patched.notes += facts.of_one_name(root)
+    patched.notes += [f"warning: {blends}"] * bool(blends)
     if trainer and not (known and known.flavour == chosen.flavour):
         reason = f"by what it imports and calls it is {known.name}, which has another API" if known else reason
         patched.notes.insert(0, f"--trainer {trainer}: {reason}")
@@ -163,7 +170,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
     """Says what to do with a checkout that no patch fits."""
     if not facts.calls_some(found) and not facts.importers(files):
-        return "name the folder in which train.py lies; `dsmoe run` runs a script of any other folder"
+        return ("name the folder in which train.py lies; a script of any other folder is run by "
+                "`dsmoe run --blend-mode smoe -- python SCRIPT ...`")
     if facts.those(found, "uses ") or "from " + facts.OF_GSPLAT in found:
         return (f"neither a patch nor `dsmoe run` can stand in for that; an import of {INTEGRATIONS} in its code can: "
                 "integrations/README.md lists their APIs")
@@ -219,7 +227,7 @@ def revert(path: PathLike) -> List[str]:
         if why:
             raise PatchError(f"{name}: without the lines of the patch it {why}. Undo your edit of them, then revert "
                              "again; nothing was touched")
-    if not back and not any(root.glob(UNFINISHED + "*")):
+    if not back and not _unfinished(root):
         raise PatchError(f"{root}: no file has a line of a patch, so nothing can be taken back")
     _write(root, back, now)
     return list(back)
@@ -268,9 +276,15 @@ def _write(root: Path, files: Mapping[str, bytes], now: Mapping[str, bytes]) -> 
         raise PatchError(f"{error.filename or root}: cannot be written: {error}; `dsmoe patch check {root}` says how "
                          "the checkout is") from None
     finally:
-        for folder in root.glob(UNFINISHED + "*"):  # but those of other processes that still run
-            if folder.suffix[1:] == str(os.getpid()) or not os.path.exists(f"/proc/{folder.suffix[1:]}/fd"):
+        for folder, process in _unfinished(root).items():  # but those of other processes that still run
+            if process == str(os.getpid()) or not os.path.exists(f"/proc/{process}/fd"):
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _unfinished(root: Path) -> Dict[Path, str]:
+    """Returns the folders of new files, of this process and others, each with the number of its process."""
+    names = ((path, OF_PROCESS.fullmatch(path.name)) for path in root.glob(UNFINISHED + "*"))
+    return {path: found[1] for path, found in names if found}
 
 
 def _check_unchanged(name: str, target: Path, there: Mapping[Path, bytes]) -> None:

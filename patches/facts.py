@@ -14,6 +14,7 @@ from diff_smoe_rasterization.integrations.contracts import (
     CONTRACTS,
     NAMES,
     RASTERIZER,
+    REFUSED,
     RESULTS,
     WORDS,
     Contract,
@@ -37,6 +38,7 @@ USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its raster
 OF_GSPLAT = "gsplat"
 FOUR_COLUMNS = "means2D of four columns"
 MODULES = {contract.module: contract for contract in CONTRACTS if contract.module not in (RASTERIZER, OF_GSPLAT)}
+STILL = "this package would not blend so; --trainer NAME takes it all the same, such as --trainer inria"
 OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their names"
 
 
@@ -55,6 +57,11 @@ def of_checkout(files: Mapping[str, bytes], script: str = "") -> Set[str]:
 def calls_some(facts: Set[str]) -> bool:
     """Whether a rasterizer is imported, of whatever kind."""
     return bool(PATCHED in facts or those(facts, "from ") or those(facts, "uses ") or those(facts, "renamed "))
+
+
+def packages(facts: Set[str]) -> Set[str]:
+    """Returns the packages that are imported as a rasterizer of Inria's kind."""
+    return those(facts, "from ") | those(facts, "renamed ")
 
 
 def _reached(files: Mapping[str, bytes], start: Sequence[str]) -> Dict[str, bytes]:
@@ -236,6 +243,9 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
         return (others[0], "") if others else (None, f"it imports gsplat and does not call its rasterization{instead}"
                                                if "has gsplat" in facts else f"nothing imports {NAMES[0]} from "
                                                f"{RASTERIZER} or {INTEGRATIONS}")
+    refused = next((reason for sign, reason in REFUSED.items() if sign in facts), None)
+    if refused:
+        return None, refused
     used = {kind + name for kind in USES for name in those(facts, kind)}
     for kind, text in USES.items():
         names = those(used - set().union(*map(_known, CONTRACTS)), kind)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,10 +20,10 @@ from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_o
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 from dsmoe.system.children import die_with_parent
 
-from . import facts
+from . import facts, kernels
 from .runtime import RASTERIZER_VARIABLE, SHIMS, STAND_INS, USED_VARIABLE, WITHOUT_VARIABLE
 from .source import PatchError
-from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
+from .trainers import GR, OF_AUTHORS, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 RENAMED = "DSMOE_RUN_RENAMED"  # the names under which the trainer imports a rasterizer that is known
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
@@ -36,6 +37,7 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
     not, with this rasterizer.
     """
     environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
+    _check_python(words[0], environment)
     for line in lines:
         print("dsmoe run: " + line, file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
@@ -85,6 +87,7 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: named,
                    BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
                    "PYTHONDONTWRITEBYTECODE": "1", RENAMED: os.pathsep.join(renamed)}  # no __pycache__ in the checkout
+    environment.setdefault("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # torch.load of checkpoints, which are tuples
     warnings += facts.of_one_name(folders[0])
     if named == "inria_2024" and not _may_use_sparse_adam(words, files, found):
         environment[WITHOUT_VARIABLE] = facts.SPARSE_ADAM
@@ -123,6 +126,10 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
         known, reason = facts.recognise(found)
+        blends = kernels.another_blend(folder, facts.packages(found)) if known and known.name != OF_AUTHORS else ""
+        if blends and not trainer:
+            raise PatchError(f"{folder}: {blends}: {facts.STILL}")
+        reasons += [f"{folder}: {blends}"] * bool(blends)
         if known and not trainer:
             return known.flavour, f"{known.name if GR in texts else 'the trainer'} in {folder}", [], found
         is_hidden = by_name[trainer or ""] == facts.OF_GSPLAT and "has gsplat" in found
@@ -140,6 +147,17 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
     raise PatchError("no trainer that is known was found; --trainer names it, or the rasterizer whose API it calls "
                      "(--trainer list prints the names):\n  " + "\n  ".join(
                          [*reasons, *below] or [f"there is no {GR} in {', '.join(map(str, files))}"]))
+
+
+def _check_python(program: str, environment: Dict[str, str]) -> None:
+    """Raises PatchError where a Python that would run the trainer has not this package."""
+    if not re.fullmatch(r"python[\d.]*", Path(program).name):
+        return
+    find = "import importlib.util as u, sys; sys.exit(not (u.find_spec('dsmoe') and u.find_spec('torch')) and 41)"
+    with contextlib.suppress(OSError):  # it is no program: what starts it will say so
+        if subprocess.run([program, "-c", find], env=environment, check=False).returncode == 41:
+            raise PatchError(f"{program} has not this package, or no PyTorch: install it there (pip install .), or "
+                             f"name the Python that has it, such as {sys.executable}")
 
 
 def _script(words: Sequence[str]) -> Optional[Path]:

@@ -68,7 +68,7 @@ def _as_it_was(found: Match[bytes]) -> bytes:
 
 def leftover(data: bytes, more: str = "") -> str:
     """Says which line still has the mark (or `more`): an edited line of the patch, or one of the user's; "" if none."""
-    found = re.search(rf".*(?:{MARK}|-DDSMOE_PATCH_STD{more}).*".encode(), data)
+    found = re.search(rf"(?m)^.*(?:{MARK}|-DDSMOE_PATCH_STD{more}).*".encode(), data)
     return f"still has `{found[0].decode(errors='replace').strip()}`" if found else ""
 
 

@@ -44,6 +44,7 @@ def rendering(file: str, blend: str = "saved_blend_of") -> Entry:
     return Entry(file, "render_sets", pipe="pipeline", blend=blend)
 
 
+OF_AUTHORS = "3d-smoe"
 TRAINING = Entry("train.py", "training")
 USUAL = (TRAINING, rendering("render.py"))
 IN_ONE_FILE = (TRAINING, rendering("train.py"))
@@ -67,7 +68,7 @@ TRAINERS = (
     Trainer("gaussianpro", "inria", USUAL, ("calls depth_propagation",)),
     Trainer("compact-3dgs", "inria", USUAL, ("imports tinycudann",)),
     # 3D SMoE Splatting (Li et al. 2025) on 3DGS of 2023: smoe unless told otherwise, with tails in every pixel.
-    Trainer("3d-smoe", "inria", (TRAINING._replace(blend="smoe_of"), rendering("render.py", "saved_smoe_of")),
+    Trainer(OF_AUTHORS, "inria", (TRAINING._replace(blend="smoe_of"), rendering("render.py", "saved_smoe_of")),
             ("calls load_init", "calls images_to_video"), "default_smoe"),
     Trainer("3dgs-2023", "inria", USUAL),
     # Rasterizers that return a depth too.

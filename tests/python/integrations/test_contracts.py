@@ -27,7 +27,6 @@ from diff_smoe_rasterization.integrations import (
     monogs,
     nearest_points,
     pixel_gs,
-    rade_gs,
     speedy_splat,
 )
 from diff_smoe_rasterization.integrations._rasterizer import classes_of
@@ -40,7 +39,7 @@ TOLERANCE = 1e-11
 N, WIDTH, HEIGHT = 30, 33, 21
 OFTEN_GIVEN = {"confidence": None, "subpixel_offset": None, "kernel_size": 0.3, "projmatrix_raw": None,
                "depth_threshold": 1.0, "metric_map": None, "get_flag": False, "f_count": False,
-               "include_mask": False, "nearest_points": None, "require_depth": False, "require_coord": False}
+               "include_mask": False, "nearest_points": None}
 
 
 def scene_of(mode, **more):
@@ -363,70 +362,3 @@ def test_results_in_any_order_and_the_depth_where_a_pixel_is_half_full(mode):
     for wrong in (("color", "depth"), ("color", "radii", "color"), ("color", "radii", "normals")):
         with pytest.raises(KeyError):
             contract_of(",".join(wrong))
-
-
-@pytest.mark.parametrize("given", ["scales", "cov3D_precomp"])
-def test_rade_gs_has_depths_and_normals_of_planes(mode, given):
-    """A plane is the tangent, by autograd, to where rays are deepest in a Gaussian. Means are by shares of a pixel."""
-    scene = random_scene(mode, N, WIDTH, HEIGHT, seed=7, degree=1, scale=0.15)
-    scene.inputs["rotations"] = torch.nn.functional.normalize(scene.inputs["rotations"])
-    covariances = reference.covariance3D(reference.Gaussians(
-        scene.inputs["means3D"], None, None, None, None, scene.inputs["scales"], scene.inputs["rotations"], None), 1.0)
-    if given == "cov3D_precomp":
-        scene.inputs.update(scales=None, rotations=None,
-                            cov3D_precomp=covariances[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)])
-    settings = {"kernel_size": 0.1, "require_depth": True, "require_coord": True}
-    color, radii, coord, median_coord, depth, median, alpha, normal = rendered(rade_gs, scene, settings)
-    own_settings = scene.settings._replace(low_pass=0.1, antialiasing=True)
-    channels = {**{name: tensor for name, tensor in scene.inputs.items() if name != "shs"},
-                "colors_precomp": torch.eye(N, dtype=torch.float64)}
-    shares = rasterize(settings=own_settings._replace(bg=torch.zeros(N, dtype=torch.float64)), **channels).color
-    expected = rasterize(settings=own_settings, **scene.inputs)
-    assert torch.equal(radii, expected.radii)
-    assert_close(color, expected.color, TOLERANCE, "color")
-
-    view, (tan_x, tan_y) = scene.settings.viewmatrix, (scene.settings.tanfovx, scene.settings.tanfovy)
-    centres = scene.inputs["means3D"] @ view[:3, :3] + view[3, :3]
-    turn = view[:3, :3].T
-    inverses = torch.linalg.inv(turn @ covariances @ turn.T)
-
-    def distance(x, y):
-        ray = torch.stack([x, y, torch.ones_like(x)], -1)
-        along = torch.einsum("ni,nij,nj->n", ray, inverses, centres) / torch.einsum("ni,nij,nj->n", ray, inverses, ray)
-        return along * ray.norm(dim=1)
-
-    middle = [(centres[:, axis] / centres[:, 2]).requires_grad_() for axis in range(2)]
-    slopes = torch.autograd.grad(distance(*middle).sum(), middle)
-    x = ((2 * torch.arange(WIDTH).double() + 1) / WIDTH - 1) * tan_x
-    y = (((2 * torch.arange(HEIGHT).double() + 1) / HEIGHT - 1) * tan_y)[:, None]
-    rays = torch.stack([x.expand(HEIGHT, WIDTH), y.expand(HEIGHT, WIDTH), torch.ones(HEIGHT, WIDTH).double()])
-    planes = sum((slope[:, None, None] * (at - start.detach()[:, None, None])
-                  for slope, at, start in zip(slopes, (x, y), middle)), distance(*middle).detach()[:, None, None])
-    planes = planes / rays.norm(dim=0)
-    total = shares.sum(0)
-    shown = total > 1e-6  # else the quotient has few digits
-    # 1e-6: the scene's projection, by which rays are found, is rounded to float32.
-    mean = (shares * planes).sum(0) / total
-    assert shown.any() and not shown.all()
-    assert_close(depth[0][shown], mean[shown], 1e-6 * mean[shown].abs().max(), "depth")
-    like = rendered(depth_alpha, scene.with_settings(low_pass=0.1, antialiasing=True))
-    assert_close(alpha, like[3], TOLERANCE, "alpha")
-    assert_close(coord[:, shown], (mean * rays)[:, shown], 1e-5, "coord")
-    towards = torch.nn.functional.normalize(-torch.einsum("nij,nj->ni", inverses, centres), dim=1)
-    sums = torch.einsum("nhw,nc->chw", shares, towards)
-    assert_close(normal[:, shown], torch.nn.functional.normalize(sums, dim=0)[:, shown], 1e-6, "normal")
-    order = centres[:, 2].argsort()
-    front = shares[order].cumsum(0)
-    clear = ((front - 0.5).abs() > 1e-9).all(0)
-    half = planes[order].gather(0, (front >= 0.5).int().argmax(0)[None])[0].masked_fill(total < 0.5, 0)
-    assert_close(median[0][clear], half[clear], 1e-5, "median")
-    assert_close(median_coord[:, clear], (half * rays)[:, clear], 1e-5, "median_coord")
-
-
-def test_rade_gs_without_depths_and_its_method_that_is_refused():
-    scene = scene_of("smoe")
-    results = rendered(rade_gs, scene, {"kernel_size": 0.0, "require_depth": False, "require_coord": False})
-    assert not any(results[place].any() for place in (2, 3, 4, 5, 7)) and results[6].any()
-    settings = rade_gs.GaussianRasterizationSettings(**scene.settings._asdict())
-    with pytest.raises(NotImplementedError, match="does not integrate Gaussians"):
-        rade_gs.GaussianRasterizer(settings).integrate(points3D=None)

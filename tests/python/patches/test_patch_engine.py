@@ -5,6 +5,7 @@ import ast
 import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -430,3 +431,29 @@ def test_the_readme_has_every_trainer_rule_and_state():
         assert all(f"`{rule.function}`" in cells[trainer.name] for rule in trainer.entries)
     assert all(f"## --{option}\n" in text for option in OPTIONS)
     assert all(f"`{state}`" in text for state in "unknown unpatchable patchable patched half-patched drifted".split())
+
+
+def test_a_folder_of_the_users_stays(tmp_path):
+    """Only a folder that ends with a process's number is of a patch that was interrupted."""
+    checkout = make(tmp_path, {".dsmoe_unfinished_my_notes/a.txt": "mine", ".dsmoe_unfinished/b.txt": "mine",
+                               ".dsmoe_unfinishedabcd1234.4194305/train.py": "left by a process that ended"})
+    patches.apply(checkout)
+    left = {path.name for path in checkout.glob(".dsmoe_unfinished*")}
+    assert left == {".dsmoe_unfinished_my_notes", ".dsmoe_unfinished"}
+    patches.revert(checkout)
+    assert (checkout / ".dsmoe_unfinished_my_notes/a.txt").read_text() == "mine"
+
+
+def test_a_long_line_is_read_in_time(tmp_path):
+    """100,000 minuses took hours: the search for a mark began anew at each."""
+    begin = time.monotonic()
+    refused(make(tmp_path, {"arguments/__init__.py": "-" * 100_000}), "is not Python that can be parsed")
+    assert time.monotonic() - begin < 10
+
+
+def test_where_no_patch_fits_dsmoe_run_is_named(tmp_path):
+    """A July of 2023 without `debug`, and a checkout without gaussian_renderer."""
+    early = patches.check(make(tmp_path / "early", {GR: RENDERER.replace("debug=pipe.debug  # slow", "")}))
+    assert early.state == "unpatchable" and "dsmoe run --blend-mode smoe -- python train.py" in early.reasons[-1]
+    flat = patches.check(make(tmp_path / "flat", {GR: None, "train.py": RENDERER + "def training(): pass\n"}))
+    assert flat.state == "unknown" and any("dsmoe run --blend-mode smoe -- python" in line for line in flat.reasons)

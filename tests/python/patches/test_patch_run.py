@@ -164,6 +164,7 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     # A second renderer beside the first, by which masks are trained.
     ({MASKS: GOF, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_gof, another rasterizer"),
     ({MASKS: GOF, GR: "from . import masks\n" + RENDERER}, PYTHON, "_gof, another rasterizer"),
+    ({GR: RENDERER.replace("debug=", "require_depth=True, debug=")}, PYTHON, "have require_depth, as RaDe-GS's"),
     ({GR: "from nvdiffrast import rasterize\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
 def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_path, dsmoe, monkeypatch):
     monkeypatch.chdir(make(tmp_path, files))
@@ -173,7 +174,6 @@ def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_pa
 
 CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs
     "mip_splatting": ("kernel_size=1, subpixel_offset=2", "", "image, radii"),
-    "rade_gs": ("kernel_size=1, require_depth=1, require_coord=1", "", "image, radii, a, b, depth, m_depth, alpha, n"),
     "mcmc": ("", "", "image, radii, is_used"), "dngaussian": ("", "", "image, radii, depth, alpha"),
     "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
@@ -502,3 +502,58 @@ def test_the_package_brings_the_shims_and_nothing_beside_itself():
         module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract.name}")
         names = NAMES if contract.module != "gsplat" else ("rasterization",)
         assert {*names, *contract.names} <= set(module.__all__)
+
+
+KERNEL = """// float alpha = 0;
+renderCUDA() {
+    float power = -0.5f * (con_o.x * d.x * d.x + con_o.z * d.y * d.y) - con_o.y * d.x * d.y;
+    float alpha = min(0.99f, con_o.w * exp(power));
+    const float weight = alpha * T;
+    C[ch] += features[collected_id[j] * CHANNELS + ch] * alpha * T;
+    D += depth[id[j]] * weight;
+    out_color[ch * H * W + pix_id] = C[ch] + T * bg_color[ch];
+}
+"""
+
+
+@pytest.mark.parametrize("old, new, named", [
+    ("", "", None), ("* alpha * T", "* weight", None), ("exp(power)", "__expf(power)", None),
+    ("-0.5f * (con_o.x * d.x * d.x + con_o.z * d.y * d.y)", "-0.5f * d.x * d.x", "the exponent"),
+    ("con_o.w * exp(power)", "con_o.w * exp(power) * 0.5f", "alpha"),
+    ("weight = alpha * T", "weight = T", "the weight"),
+    ("* alpha * T", "* alpha * weight", "the colour"), ("C[ch] + T", "C[ch] / sum + T", "the pixel")])
+@pytest.mark.parametrize("package", ["diff_gaussian_rasterization", "another"])
+def test_kernels_in_the_checkout_that_blend_something_else_are_refused(old, new, named, package, tmp_path, monkeypatch):
+    own = {"submodules/own/setup.py": f"setup(name='{package}')\n",
+           "submodules/own/cuda_rasterizer/forward.cu": KERNEL.replace(old, new)}
+    monkeypatch.chdir(make(tmp_path, own))
+    words = [sys.executable, "train.py"], "smoe"
+    if named is None or package == "another":
+        assert patches.check(tmp_path).state == "patchable"
+        run.prepare(*words, None, environment())
+        return
+    said = f"forward.cu blends something else than 3DGS: {named} there is"
+    with pytest.raises(patches.PatchError, match=said):
+        run.prepare(*words, None, environment())
+    planned = patches.check(tmp_path)
+    assert planned.state == "unknown" and said in planned.reasons[0]
+    assert said in run.prepare(*words, "inria", environment())[1][1], "named on request, with a warning"
+    assert any(said in note for note in patches.check(tmp_path, trainer="3dgs-2023").notes)
+
+
+def test_a_python_without_this_package_is_named(tmp_path, dsmoe, monkeypatch):
+    monkeypatch.chdir(make(tmp_path))
+    bare = tmp_path / "bin/python3"
+    bare.parent.mkdir()
+    bare.write_text(f"#!/bin/sh\nPYTHONPATH= exec {sys.executable} -S -E \"$@\"\n")
+    bare.chmod(0o755)
+    result = dsmoe(*RUN, "--", bare, "train.py")
+    assert result.status == 1 and "has not this package, or no PyTorch: install it there" in result.err
+
+
+@pytest.mark.parametrize("variable", [None, "0"])
+def test_checkpoints_of_more_than_tensors_load(variable, tmp_path, monkeypatch):
+    monkeypatch.chdir(make(tmp_path))
+    given = {} if variable is None else {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": variable}
+    made, _ = run.prepare([sys.executable, "train.py"], "smoe", None, environment(**given))
+    assert made["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] == (variable or "1")
