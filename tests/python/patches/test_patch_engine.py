@@ -306,7 +306,7 @@ def test_two_at_once_do_not_share_new_files(tmp_path, monkeypatch):
     make(tmp_path)
     with subprocess.Popen(["true"]) as ended:
         pass
-    of_a_third, left = (tmp_path / f"{engine.UNFINISHED}abc.{number}" for number in (os.getppid(), ended.pid))
+    of_a_third, left = (tmp_path / f"{engine.UNFINISHED}abcdefgh.{number}" for number in (os.getppid(), ended.pid))
     of_a_third.mkdir()
     left.mkdir()
 
