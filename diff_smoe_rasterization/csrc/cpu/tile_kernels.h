@@ -60,15 +60,24 @@ template <class S> struct TileKernels {
   PassKernel<S, GateMapPass<S>> gate_map;
 };
 
-// One of these per instruction set that the compiler can build for.
+// Those of each instruction set that the compiler can build for. Double has none of AVX-512, nor much optimization
+// (CMakeLists.txt): nobody trains in it, and it would take as long to compile as float.
+extern const TileKernels<float> kBaselineFloat;
+extern const TileKernels<double> kBaselineDouble;
+#if defined(__x86_64__)
+extern const TileKernels<float> kAvx2Float, kAvx512Float;
+extern const TileKernels<double> kAvx2Double;
+#endif
+
 struct SimdLevel {
   const char* name;
-  TileKernels<float> float_kernels;
-  TileKernels<double> double_kernels;
+  const TileKernels<float>& float_kernels;
+  const TileKernels<double>& double_kernels;
 };
-extern const SimdLevel kBaselineLevel;
+constexpr SimdLevel kBaselineLevel = {"baseline", kBaselineFloat, kBaselineDouble};
 #if defined(__x86_64__)
-extern const SimdLevel kAvx2Level, kAvx512Level;
+constexpr SimdLevel kAvx2Level = {"avx2", kAvx2Float, kAvx2Double};
+constexpr SimdLevel kAvx512Level = {"avx512", kAvx512Float, kAvx2Double};
 #endif
 
 // The best level that this processor has, or the lower one that DSMOE_SIMD names; decided once.

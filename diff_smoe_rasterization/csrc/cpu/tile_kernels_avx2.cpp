@@ -14,13 +14,21 @@
 #pragma GCC target("avx2,fma")
 #endif
 
+#ifdef DSMOE_DOUBLE
+#define DSMOE_SIMD avx2_double
+#else
 #define DSMOE_SIMD avx2
+#endif
 #define DSMOE_SIMD_BYTES 32
 #include "tile_kernels_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-constexpr SimdLevel kAvx2Level = {"avx2", avx2::kernels<float>(), avx2::kernels<double>()};
+#ifdef DSMOE_DOUBLE
+constexpr TileKernels<double> kAvx2Double = DSMOE_SIMD::kernels<double>();
+#else
+constexpr TileKernels<float> kAvx2Float = DSMOE_SIMD::kernels<float>();
+#endif
 }  // namespace cpu
 }  // namespace dsmoe
 

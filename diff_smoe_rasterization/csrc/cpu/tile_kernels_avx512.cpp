@@ -22,7 +22,7 @@
 
 namespace dsmoe {
 namespace cpu {
-constexpr SimdLevel kAvx512Level = {"avx512", avx512::kernels<float>(), avx512::kernels<double>()};
+constexpr TileKernels<float> kAvx512Float = DSMOE_SIMD::kernels<float>();
 }  // namespace cpu
 }  // namespace dsmoe
 

@@ -1,10 +1,23 @@
 // The names of tensor.h by LibTorch's C++ classes.
 #pragma once
 
-#include <ATen/ATen.h>
+// Not ATen/ATen.h, which takes seconds to compile.
 #include <ATen/Parallel.h>
+#include <ATen/core/Tensor.h>
 #include <ATen/core/dispatch/Dispatcher.h>  // OperatorHandle
 #include <ATen/core/stack.h>
+#include <ATen/ops/all.h>
+#include <ATen/ops/amax.h>
+#include <ATen/ops/amin.h>
+#include <ATen/ops/argsort.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
+#include <ATen/ops/index_select.h>
+#include <ATen/ops/isfinite.h>
+#include <ATen/ops/isnan.h>
+#include <ATen/ops/logical_and.h>
+#include <ATen/ops/logical_not.h>
+#include <ATen/ops/nonzero.h>
 #include <c10/core/DeviceGuard.h>
 #include <torch/library.h>
 

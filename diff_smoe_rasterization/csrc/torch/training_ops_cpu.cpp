@@ -9,7 +9,7 @@ namespace {
 
 constexpr int64_t kChunk = 1 << 14;  // Gaussians a thread takes at a time
 
-struct Cpu {
+struct TrainingCpu {
   template <class S> static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step) {
     cpu::adam(tensors, step, num_threads());
   }
@@ -54,4 +54,4 @@ struct Cpu {
 }  // namespace binding
 }  // namespace dsmoe
 
-DSMOE_LIBRARY_IMPL(CPU, m) { dsmoe::binding::register_training_ops<dsmoe::binding::Cpu>(m); }
+DSMOE_LIBRARY_IMPL(CPU, m) { dsmoe::binding::register_training_ops<dsmoe::binding::TrainingCpu>(m); }

@@ -7,7 +7,7 @@ namespace dsmoe {
 namespace binding {
 namespace {
 
-struct Cuda {
+struct TrainingCuda {
   template <class S> static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step) {
     cuda::adam(tensors, step, current_stream());
   }
@@ -70,4 +70,4 @@ struct Cuda {
 }  // namespace binding
 }  // namespace dsmoe
 
-DSMOE_LIBRARY_IMPL(CUDA, m) { dsmoe::binding::register_training_ops<dsmoe::binding::Cuda>(m); }
+DSMOE_LIBRARY_IMPL(CUDA, m) { dsmoe::binding::register_training_ops<dsmoe::binding::TrainingCuda>(m); }
