@@ -60,6 +60,9 @@ def assert_equal(one, other):
     for key in ("gradient_sum", "view_count"):
         if key in states[0]["strategy"]:
             assert torch.equal(states[0]["strategy"][key], states[1]["strategy"][key])
+    assert set(states[0]["average"]) == set(states[1]["average"])
+    for name, tensor in states[0]["average"].items():
+        assert torch.equal(tensor, states[1]["average"][name])
     assert one.background_gate == other.background_gate
 
 
@@ -81,10 +84,11 @@ def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
 @pytest.mark.parametrize("options", [
     dict(blend_mode="alpha"), dict(blend_mode="smoe", background_gate="learned", random_background=True),
     dict(blend_mode="alpha", strategy="mcmc", budget=60),
-    dict(blend_mode="smoe", strategy="importance", budget=60, strategy_options="views=3,moves=0.2")], ids=str)
+    dict(blend_mode="smoe", strategy="importance", budget=60, strategy_options="views=3,moves=0.2", iterations=50)],
+    ids=str)
 @pytest.mark.parametrize("masked", [False, True])
 def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypatch, options, masked):
-    """Whatever comes between: densifications, looks, evaluations, other losses, degrees and backgrounds."""
+    """Whatever comes between: densifications, looks, evaluations, other losses, degrees, backgrounds and an average."""
     monkeypatch.setattr("dsmoe.training.graphs.WARM_UP", 3)
     monkeypatch.setattr("diff_smoe_rasterization.lazy_adam._CAPACITY", 7)
     if masked:
@@ -99,10 +103,11 @@ def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypa
     for trainer in trainers:
         torch.manual_seed(5)
         reports.append([])
-        for step in range(40):
+        for step in range(config.iterations):
             trainer.step(trainer.evaluate if step % 7 == 6 else None)
             reports[-1].append((float(trainer.training_psnr()), trainer.num_gaussians))
     assert repeats.replays > 30
+    assert bool(trainers[0].optimizer.average) == (config.iterations > 42)
     assert all(report == reports[0] for report in reports)
     for other in trainers[1:]:
         assert_equal(trainers[0], other)
