@@ -1,3 +1,3 @@
 // The same for double. Its namespace is its own, because it is compiled with other flags.
 #define DSMOE_DOUBLE
-#include "tile_kernels_baseline.cpp"
+#include "tile_kernels_baseline.cpp"  // NOLINT(bugprone-suspicious-include)
