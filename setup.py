@@ -262,7 +262,11 @@ def extension():
             run_cmake("--build", folder, "--parallel", jobs(), "--target", "dsmoe_package")
             path = Path(self.get_ext_fullpath(module.name))
             path.parent.mkdir(parents=True, exist_ok=True)
-            for name in ("libdsmoe.so", "_ops.so", *(f"_core{suffix}" for suffix in pythons(stable))):
+            names = ["libdsmoe.so", "_ops.so", *(f"_core{suffix}" for suffix in pythons(stable))]
+            for left in path.parent.glob("_core*.so"):  # of another Python, over an earlier libdsmoe.so
+                if left.name not in names:
+                    left.unlink()
+            for name in names:
                 replace(folder / "package" / name, path.with_name(name))
             lines = ['"""What the extension was built against; readable even where it cannot be loaded."""']
             lines += [f"{name} = {value!r}" for name, value in built_against.items()]
@@ -272,7 +276,7 @@ def extension():
 
 
 def any_python():
-    """Returns the command that names a wheel py3-none: which Pythons it is for, its files _core say."""
+    """Returns the command that names a wheel by the Pythons that it has a _core for, such as cp310.cp312-none."""
     try:
         from setuptools.command.bdist_wheel import bdist_wheel
     except ImportError:  # setuptools before 70.1
@@ -280,7 +284,8 @@ def any_python():
 
     class AnyPython(bdist_wheel):
         def get_tag(self):
-            return ("py3", "none", super().get_tag()[2])
+            releases = sorted(re.search(r"cpython-(\d+)", suffix)[1] for suffix in pythons(stable=True))
+            return (".".join("cp" + release for release in releases), "none", super().get_tag()[2])
 
     return {"bdist_wheel": AnyPython}
 

@@ -50,6 +50,16 @@ class ProcessGate:
         if not _HAS_HOOKS:
             self._value.register_hook(self._step)
 
+    @property
+    def learns(self) -> bool:
+        """Whether a rendering of this process had its gradient."""
+        return self._learns
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is learned here, or a file has said it."""
+        return not self.frozen or self._found is not None
+
     def value(self) -> float:
         """Returns lambda; on a GPU the host waits for it. Raises RuntimeError where a trained model has not said it."""
         if self._found is not None:

@@ -78,7 +78,7 @@ def recorded() -> Dict[str, Any]:
         return {}
     background_gate = settings.resolve_background_gate(mode, background_gate)
     is_learned = isinstance(background_gate, str)
-    if is_learned and not gate.blend_mode:
+    if is_learned and not (gate.blend_mode and gate.is_known):
         return {}  # nothing was rendered with it
     return {"blend_mode": mode, "background_gate": gate.value() if is_learned else background_gate,
             **({"learned": gate.state_dict()} if is_learned and not gate.frozen else {})}
@@ -159,13 +159,16 @@ def _is_checkpoint(loaded: Any) -> bool:
 
 
 def _found(file: Any, record: Optional[Dict[str, Any]], is_model: bool) -> None:
-    """Gives the learned gate what a file records. A model without a record: 0, and a warning."""
+    """Gives the learned gate what a file records. A model without a record: 0, and a warning.
+
+    While the gate is learned, only a model brings another: other files of the training record it too.
+    """
     mode, background_gate = settings.blend_of_process or (settings.resolve_blend_mode(None), None)
     name = file if _is_path(file) else "the model"
-    if record:
+    if record and (is_model or not gate.learns):
         gate.found(float(record["background_gate"]), record.get("learned"))
         print(f"{PROGRAM}: {name} records the background gate {gate.value():.6g}", file=sys.stderr, flush=True)
-    elif is_model and mode in settings.GATED_MODES and isinstance(
+    elif not record and is_model and not gate.learns and mode in settings.GATED_MODES and isinstance(
             settings.resolve_background_gate(mode, background_gate), str):
         gate.found(0.0)
         warnings.warn(f"{PROGRAM}: {name} records no background gate, so it is 0 where nothing is learned, and "
