@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import weakref
-from typing import Any, Dict, Iterable, Optional, Sequence, Union
+from typing import Any, Dict, Iterable, Optional, Sequence, Tuple, Union
 
 import torch
 
@@ -22,6 +22,27 @@ RATE = 0.03  # of Adam, for the logarithm
 BETAS = (0.9, 0.999)
 EPSILON = 1e-8
 LIMIT = math.log(MAX_BACKGROUND_GATE)  # of |log lambda|: beyond it float32 would soon be 0 or infinite
+
+
+def launch_step(logarithm: torch.Tensor, moment: torch.Tensor, square: torch.Tensor, value: torch.Tensor,
+                gradient: torch.Tensor, rate: float, root_scale: float, betas: Tuple[float, float],
+                bound: float) -> None:
+    """One step of Adam in place on a gate's logarithm p; value becomes bound + exp(p). Tensors [1]; nothing waits.
+
+    gradient: by the value. rate, root_scale: as `corrected_rates` gives them.
+    """
+    torch.ops.diff_smoe_rasterization.gate_adam(logarithm, moment, square, value, gradient, rate, root_scale, *betas,
+                                                EPSILON, bound, LIMIT)
+
+
+def step_gate(logarithm: torch.Tensor, adam: Dict[str, Any], value: torch.Tensor, gradient: torch.Tensor, rate: float,
+              betas: Tuple[float, float], bound: float) -> None:
+    """`launch_step` with Adam's state, {} before the first step, and a rate that is not corrected yet."""
+    if not adam:
+        adam.update(step=0, exp_avg=torch.zeros_like(logarithm), exp_avg_sq=torch.zeros_like(logarithm))
+    adam["step"] = int(adam["step"]) + 1
+    corrected = corrected_rates({"lr": rate, "betas": betas}, adam["step"])
+    launch_step(logarithm, adam["exp_avg"], adam["exp_avg_sq"], value, gradient, *corrected, betas, bound)
 
 
 class ProcessGate:
@@ -151,14 +172,8 @@ class ProcessGate:
     @torch.no_grad()
     def _step(self, gradient: torch.Tensor) -> None:
         """One step. A gradient that is not finite, as of a scaled loss that overflowed, counts as 0."""
-        adam = self._adam
-        if not adam:
-            adam.update(step=0, exp_avg=torch.zeros_like(gradient), exp_avg_sq=torch.zeros_like(gradient))
-        adam["step"] = int(adam["step"]) + 1
         finite = torch.nan_to_num(gradient, 0.0, 0.0, 0.0)
-        torch.ops.diff_smoe_rasterization.gate_adam(
-            self._logarithm, adam["exp_avg"], adam["exp_avg_sq"], self._value, finite,
-            *corrected_rates({"lr": RATE, "betas": BETAS}, adam["step"]), *BETAS, EPSILON, 0.0, LIMIT)
+        step_gate(self._logarithm, self._adam, self._value, finite, RATE, BETAS, 0.0)
         self._found = None
 
 

@@ -6,15 +6,10 @@ from typing import Any, Dict
 
 import torch
 
-from diff_smoe_rasterization.optimizers import corrected_rates
-from diff_smoe_rasterization.settings import MAX_BACKGROUND_GATE
+from diff_smoe_rasterization.learned_gate import launch_step, step_gate
 
 from ..config import TrainConfig
 from ..optimizer import batch_betas
-
-LIMIT = math.log(MAX_BACKGROUND_GATE)  # of |p|: beyond it float32 would soon be 0 or infinite
-EPSILON = 1e-8  # of Adam
-_OPS = torch.ops.diff_smoe_rasterization
 
 
 class LearnedGate:
@@ -27,7 +22,7 @@ class LearnedGate:
         """config: has bound, start and rate; by its views a step rate and betas go as those of the Gaussians."""
         self.bound = config.background_gate_bound
         self.logarithm = torch.full((1,), math.log(config.background_gate_start - self.bound), device=device)
-        self._group = {"lr": config.background_gate_lr * math.sqrt(config.batch), "betas": batch_betas(config.batch)}
+        self._rate, self._betas = config.background_gate_lr * math.sqrt(config.batch), batch_betas(config.batch)
         self._adam: Dict[str, Any] = {}
         self.value = torch.zeros_like(self.logarithm)  # [1], always this tensor, so that renderers may hold it
         self._evaluate()
@@ -36,21 +31,12 @@ class LearnedGate:
     @torch.no_grad()
     def step(self) -> None:
         """One step of Adam by `gradient`; the host does not wait for the device."""
-        adam = self._adam
-        if not adam:
-            adam.update(step=0, exp_avg=torch.zeros_like(self.value), exp_avg_sq=torch.zeros_like(self.value))
-        adam["step"] = int(adam["step"]) + 1
-        self._launch(adam["exp_avg"], adam["exp_avg_sq"], self.gradient, *corrected_rates(self._group, adam["step"]))
+        step_gate(self.logarithm, self._adam, self.value, self.gradient, self._rate, self._betas, self.bound)
 
     def _evaluate(self) -> None:
         """Sets the value by a step of nothing: so it has the bits that a step gives it."""
         moment, square, gradient = self.logarithm.new_zeros(3, 1)
-        self._launch(moment, square, gradient, 0.0, 1.0)
-
-    def _launch(self, moment: torch.Tensor, square: torch.Tensor, gradient: torch.Tensor, rate: float,
-                root_scale: float) -> None:
-        _OPS.gate_adam(self.logarithm, moment, square, self.value, gradient, rate, root_scale, *self._group["betas"],
-                       EPSILON, self.bound, LIMIT)
+        launch_step(self.logarithm, moment, square, self.value, gradient, 0.0, 1.0, self._betas, self.bound)
 
     def state_dict(self) -> Dict[str, Any]:
         """Tensors and plain values of a checkpoint."""

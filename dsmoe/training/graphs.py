@@ -74,7 +74,6 @@ class Captured:
         return self.drawn
 
 
-
 class NoGraphs:
     """Captures nothing."""
 
