@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import json
 import os
 import re
 import shutil
@@ -85,6 +86,26 @@ def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
     torch.manual_seed(77)
     assert train(alone, resume=True, progress=False)["psnr"] == row["psnr"]
     assert model_of(alone) == model_of(straight)
+
+
+@needs_gloo
+@needs_torchrun
+def test_three_processes_decide_as_one(tiny_config, tmp_path):
+    """Splits, clones, prunes and resets of 3dgs; relocation, growth and noise of mcmc. The test above has importance.
+
+    Of mcmc's steps, which have two views, one process blends nothing.
+    """
+    options = [dict(batch=4), dict(batch=2, strategy="mcmc", budget=200, blend_mode="alpha", densification_interval=4,
+                                   opacity_lr=1.0)]  # so that some die
+    configs = [tiny_config.changed(**each, output=str(tmp_path / f"one_{index}"))
+               for index, each in enumerate(options)]
+    others = [config.changed(output=str(tmp_path / f"three_{index}")) for index, config in enumerate(configs)]
+    rows = [train(config, progress=False) for config in configs]
+    assert rows[0]["num_gaussians"] != rows[0]["protocol"]["init_points"] and rows[1]["num_gaussians"] == 200
+    status, _, errors = torchrun(3, os.path.join(HERE, "several_trainings.py"),
+                                 *(json.dumps(config.record()) for config in others))
+    assert status == 0, errors
+    assert [model_of(config) for config in others] == [model_of(config) for config in configs]
 
 
 @needs_gloo
