@@ -53,9 +53,9 @@ def build_parser() -> argparse.ArgumentParser:
     earlier_run.add_argument("--overwrite", action="store_true",
                              help="replace the run in OUT, once this one can start; other files there stay")
     groups["run"].add_argument(
-        "--gpus", type=int, metavar="N",
+        "--gpus", metavar="N",
         help="train on so many GPUs of this machine: torchrun starts this command once for each; with --batch N or "
-             "more")
+             "more. auto: on all of them, but on no more than --batch keeps busy")
     groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
 
     scene = commands.add_parser("scene", help="make a scene of photographs",

@@ -235,8 +235,16 @@ def test_processes_that_do_not_meet_say_so(monkeypatch, capsys):
 
 def test_more_gpus_than_there_are_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(TrainerError, match="--gpus is 3; it must be at least 1 and at most 2"):
-        torchrun_module.check_gpus(3, "cuda")
+    for asked in ("3", "0", "-1", "all"):
+        with pytest.raises(TrainerError, match=f"--gpus is {asked}; it must be auto, or at least 1 and at most 2"):
+            torchrun_module.chosen_gpus(asked, "cuda", 4)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
-    with pytest.raises(TrainerError, match="torch finds no GPU here; on CPUs start torchrun with --device cpu"):
-        torchrun_module.check_gpus(3, "cuda")
+    for asked in ("3", "auto"):
+        with pytest.raises(TrainerError, match="torch finds no GPU here; on CPUs start torchrun with --device cpu"):
+            torchrun_module.chosen_gpus(asked, "cuda", 4)
+
+
+@pytest.mark.parametrize("batch, gpus", [(1, 1), (3, 3), (8, 4)])
+def test_auto_takes_all_gpus_that_a_batch_keeps_busy(monkeypatch, batch, gpus):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert torchrun_module.chosen_gpus("auto", "cuda", batch) == gpus
