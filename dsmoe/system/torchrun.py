@@ -29,8 +29,8 @@ def chosen_gpus(asked: str, device: str, batch: int) -> int:
         return min(there, batch)
     number = int(asked) if re.fullmatch(r"\d{1,9}", asked, re.ASCII) else 0
     if not 1 <= number <= there:
-        raise ConfigError(f"{GPUS} is {asked}; it must be {AUTO}, or at least 1 and at most {there}: so many GPUs torch "
-                          "finds here")
+        raise ConfigError(f"{GPUS} is {asked}; it must be {AUTO}, or at least 1 and at most {there}: so many GPUs "
+                          "torch finds here")
     return number
 
 

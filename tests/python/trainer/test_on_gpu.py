@@ -198,16 +198,27 @@ def test_a_deterministic_training_to_a_budget_repeats_bit_for_bit(config, scene)
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_two_gpus_train_the_bits_of_one(config, tmp_path):
-    config = config.changed(batch=4, deterministic=True, output=str(tmp_path / "one"))
+@pytest.mark.parametrize("options", [
+    dict(), dict(strategy="mcmc", budget=170),
+    dict(strategy="importance", budget=60, iterations=60, strategy_options="removals=4,views=5,moves=0.2")], ids=str)
+def test_two_gpus_train_the_bits_of_one(config, tmp_path, options):
+    """From the same start, and from a checkpoint of one GPU. The background's gate is learned."""
+    config = config.changed(batch=4, deterministic=True, output=str(tmp_path / "one"), checkpoint_every=20, **options)
+    others = [dataclasses.replace(config, output=str(tmp_path / folder)) for folder in ("two", "resumed")]
     train(config, progress=False)
-    words = ["train", config.scene, "-o", str(tmp_path / "two"), "--gpus", "2", "--quiet", "--deterministic"]
-    for name in ("batch", "iterations", "blend_mode", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
-                 "densification_interval", "opacity_reset_interval", "densify_grad_threshold"):
-        words += ["--" + name.replace("_", "-"), str(getattr(config, name))]
-    assert main(words) == 0
+    broken = Run(new_trainer(others[1], load_scene(config, progress=False)), progress=False)
+    os.makedirs(others[1].output)
+    others[1].save(others[1].output)
+    steps_of(broken.trainer, 5)
+    broken.save_checkpoint()
+    words = ["train", config.scene, "-o", others[0].output, "--gpus", "2", "--quiet", "--deterministic"]
+    for name in ("batch", "budget", "strategy", "strategy_options", "iterations", "blend_mode", "sh_degree_interval",
+                 "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
+                 "densify_grad_threshold"):
+        words.append(f"--{name.replace('_', '-')}={getattr(config, name)}")
+    assert main(words) == 0 and main(["train", "--resume", "-o", others[1].output, "--gpus", "2", "--quiet"]) == 0
     models = []
-    for folder in ("one", "two"):
-        with open(model_path(str(tmp_path / folder), config.iterations), "rb") as file:
+    for each in (config, *others):
+        with open(model_path(each.output, config.iterations), "rb") as file:
             models.append(file.read())
-    assert models[0] == models[1]
+    assert models[0] == models[1] == models[2]
