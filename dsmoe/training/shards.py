@@ -5,6 +5,10 @@ from typing import Callable, NamedTuple
 
 import torch
 
+BITS = 21  # of a coordinate: three of them fill an int64
+SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+          (2, 0x1249249249249249))  # shifts and masks that move bit i of a number to bit 3 i
+
 
 class Route(NamedTuple):
     """Pairs of a Gaussian and a place, which takes something of it: what a process has of them."""
@@ -12,11 +16,6 @@ class Route(NamedTuple):
     origins: torch.Tensor  # own rows from which something goes, as often as it does
     places: torch.Tensor  # own rows to which something comes
     send: Callable[[torch.Tensor], torch.Tensor]  # from a row for each of `origins` to one for each of `places`
-
-
-BITS = 21  # of a coordinate: three of them fill an int64
-SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-          (2, 0x1249249249249249))  # shifts and masks that move bit i of a number to bit 3 i
 
 
 def z_order(points: torch.Tensor) -> torch.Tensor:
