@@ -34,7 +34,7 @@ TERMS = 100  # in densify_until_iter, at least, where that has so many steps
 NEEDED_COST = 1e-3
 
 NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
-ROWS_AT_ONCE = 2 ** 16  # whose distances to all cameras are in memory
+NUMBERS_AT_ONCE = 2 ** 22  # coordinates of Gaussians, each seen from every camera: 16 MB of them are in memory
 
 # Growth beyond this many, or beyond twice the budget where that is more, would cost time and memory: no budget above
 # 200,000 was tried with more.
@@ -103,7 +103,7 @@ class ImportanceStrategy(SteadyStrategy):
 
         They are haze that changes the training views a little, and covers a test view whose camera is closer to them.
         """
-        parts = self.context.model.raw["means3D"].detach().split(ROWS_AT_ONCE)
+        parts = self.context.model.raw["means3D"].detach().split(max(1, NUMBERS_AT_ONCE // self.cameras.numel()))
         return torch.cat([((part[:, None] - self.cameras).square().sum(2) < self.free_radii.square()).any(1)
                           for part in parts])
 

@@ -292,7 +292,7 @@ def test_removal_takes_what_floats_in_front_of_a_camera(tiny_config, monkeypatch
 
 def test_what_floats_in_front_of_a_camera_moves(tiny_config, monkeypatch):
     """Whatever it costs, and nothing moves there; in parts of the Gaussians as at once."""
-    monkeypatch.setattr("dsmoe.training.importance_strategy.ROWS_AT_ONCE", 9)
+    monkeypatch.setattr("dsmoe.training.importance_strategy.NUMBERS_AT_ONCE", 99)
     trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     strategy, count = trainer.strategy, trainer.model.num_gaussians
     floating(trainer, [20, 50])

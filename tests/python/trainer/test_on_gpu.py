@@ -102,6 +102,25 @@ def test_captured_steps_give_the_bits_of_launched_ones(config, scene, monkeypatc
         assert launched.background_gate == other.background_gate
 
 
+@pytest.mark.parametrize("always", [False, True])
+def test_without_memory_for_a_capture_the_bits_stay(config, scene, monkeypatch, capsys, always):
+    """Torch refuses the first pool, which asks for a petabyte and more; the next one too, or else that is captured."""
+    monkeypatch.setattr(graphs, "WARM_UP", 3)
+    launched, short = (Trainer(dataclasses.replace(config, deterministic=True), scene) for _ in range(2))
+    launched.passes._graphs, of_short = graphs.NoGraphs(), short.passes._graphs
+    of_short._bytes = 2.0**50
+    if always:
+        monkeypatch.setattr(graphs.CudaGraphs, "_free", lambda self, free=graphs.CudaGraphs._free: (
+            free(self), setattr(self, "_bytes", 2.0**50)))
+    for trainer in (launched, short):
+        torch.manual_seed(7)
+        steps_of(trainer, 20)
+    assert (of_short._keeper is None) == always
+    assert ("no memory for steps as CUDA graphs" in capsys.readouterr().err) == always
+    for name in PARAMETERS:
+        assert torch.equal(launched.model.raw[name], short.model.raw[name]), name
+
+
 @pytest.mark.parametrize("options", [dict(), dict(background_gate="learned", random_background=True)])
 def test_a_step_does_not_wait_for_the_device(config, scene, monkeypatch, options):
     monkeypatch.setattr(graphs, "WARM_UP", 12)  # launched, captured and replayed below
