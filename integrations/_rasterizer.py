@@ -12,10 +12,11 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.learned_gate import gate_of
+from diff_smoe_rasterization.rasterizer import visible_radii
 from diff_smoe_rasterization.settings import resolve_blend
 
 from ._walk import median_of, weights_of
-from .contracts import RESULTS, contract_of
+from .contracts import FEATURES, RESULTS, contract_of
 
 ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",),
               "opacity": ("alpha",)}
@@ -61,7 +62,38 @@ def share_of_gaussians(alpha: torch.Tensor, settings: Settings) -> torch.Tensor:
 
 
 def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
-    """Renders as `rasterize`, and returns results by their names, as RESULTS explains them."""
+    """Renders as `rasterize`, and returns results by their names, as RESULTS explains them.
+
+    settings, inputs: they may have what is free in contracts.py: see `as_ours`. The FEATURES among the inputs are
+    blended in the same rendering; without them their image is black.
+    """
+    settings, inputs = as_ours(settings, inputs)
+    features = {result: inputs.pop(argument, None) for argument, (result, _) in FEATURES.items()}
+    is_wanted = getattr(settings, "include_feature", None)
+    if is_wanted is not None and not is_wanted:
+        features["language_feature"] = None
+    given = {name: features[name].flatten(1) for name in names if features.get(name) is not None
+             and features[name].dim() > 1}
+    if given:
+        shs, colors = inputs.pop("shs", None), inputs.pop("colors_precomp", None)
+        if colors is None or colors.numel() == 0 and shs is not None:
+            colors = reference.color(reference.Gaussians(inputs["means3D"], None, None, shs, None, None, None, None),
+                                     settings)
+        inputs["colors_precomp"] = torch.cat([colors, *given.values()], 1)
+        settings = settings._replace(bg=pad(settings.bg, (0, sum(rows.shape[1] for rows in given.values()))))
+    found = _rendered([name for name in names if name not in features], settings, inputs)
+    image = found["color"]
+    if given:
+        found["color"], *images = image.split([colors.shape[1], *(rows.shape[1] for rows in given.values())])
+        found.update(zip(given, images))
+    for result, channels in FEATURES.values():
+        if result in names and result not in found:
+            found[result] = image.new_zeros(channels, *image.shape[1:])
+    return tuple(found[name] for name in names)
+
+
+def _rendered(names: Sequence[str], settings: Settings, inputs: Dict[str, Any]) -> Dict[str, torch.Tensor]:
+    """Returns results by their names, and perhaps others, of what the package's own rasterizer knows."""
     found: Dict[str, Any] = {}
     outputs = sorted({output for name in names for output in ON_REQUEST.get(name, ())})
     if not set(COUNTED).isdisjoint(names):
@@ -83,7 +115,57 @@ def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any])
         found["depth"] = rendering.depth * found["alpha"]
     if "median_depth" in names:
         found["median_depth"] = _median_depth(settings, inputs)
-    return tuple(found[name] for name in names)
+    return found
+
+
+def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[str, Any]]:
+    """Returns settings and inputs for this package's rasterizer, from those of others, whose settings have None for
+    what is not given.
+
+    - `kernel_size` is `low_pass`, with opacities compensated as under `antialiasing` (Mip-Splatting). Its
+      `subpixel_offset` other than zeros is refused.
+    - `depth_threshold` multiplies the gradient of means2D by (z / depth_threshold)^2, at most 1 (Pixel-GS).
+    - `theta` and `rho` [3] among the inputs are a small rotation and translation that follow world to view. They get
+      the camera's gradient, and their values are not read (MonoGS).
+    - `nearest_points` other than None are refused.
+
+    Raises NotImplementedError.
+    """
+    own, inputs = settings._asdict(), dict(inputs)
+    offset = own.get("subpixel_offset")
+    if offset is not None and offset.numel() > 0 and bool(offset.any()):
+        raise NotImplementedError("rasterize: subpixel_offset is not zero (Mip-Splatting's --sample_more_highres); "
+                                  "this package samples pixels only at their centres")
+    if own.get("nearest_points") is not None:
+        raise NotImplementedError("rasterize: nearest_points are set (a scene of DUSt3R); this package does not turn "
+                                  "gradients towards points; train without them, as on a COLMAP scene")
+    if own.get("kernel_size") is not None:
+        settings = settings._replace(low_pass=own["kernel_size"], antialiasing=True)
+    points = inputs.get("means2D")
+    if own.get("depth_threshold") and points is not None:
+        depths = (inputs["means3D"] @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]).detach()
+        factors = (depths / own["depth_threshold"]).square().clamp(max=1)
+        inputs["means2D"] = scaled_gradients(factors, {"": points})[""]
+    theta, rho = inputs.pop("theta", None), inputs.pop("rho", None)
+    if theta is not None or rho is not None:
+        settings = _moved(settings, theta, rho)
+    return settings, inputs
+
+
+def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torch.Tensor]) -> Settings:
+    """Returns the settings with a camera that depends on theta and rho, at 0, to first order."""
+    view = settings.viewmatrix  # transposed
+    zero = view.new_zeros(3)
+    x, y, z = (zero if theta is None else theta.reshape(3) - theta.reshape(3).detach()).unbind()
+    nothing = torch.zeros_like(x)
+    turn = torch.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing]).reshape(3, 3)  # turn @ v = theta x v
+    step = torch.cat([turn.T, (zero if rho is None else rho.reshape(3) - rho.reshape(3).detach())[None]])  # transposed
+    moved = view + torch.cat([view[:, :3] @ step[:3] + view[:, 3:] * step[3:], view.new_zeros(4, 1)], 1)
+    projection = getattr(settings, "projmatrix_raw", None)
+    if projection is None:  # what the product of both says
+        projection = torch.linalg.solve(view, settings.projmatrix)
+    centre = -moved[3, :3] @ torch.linalg.inv(moved[:3, :3])
+    return settings._replace(viewmatrix=moved, projmatrix=moved @ projection, campos=centre)
 
 
 def median_places(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
@@ -106,31 +188,15 @@ def _median_depth(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
     return (means @ view[:3, 2] + view[3, 2])[which.clamp(min=0)].masked_fill(which < 0, 0)[None]
 
 
-def results_with_features(names: Sequence[str], settings: Settings, inputs: Dict[str, Any], feature: str,
-                          features: torch.Tensor) -> Tuple[torch.Tensor, ...]:
-    """Returns `results_of`, in one rendering with features [N, F] or [N, 1, F], whose image is the result `feature`."""
-    features = features.flatten(1)
-    inputs = dict(inputs)
-    shs, colors = inputs.pop("shs", None), inputs.pop("colors_precomp", None)
-    if colors is None or colors.numel() == 0 and shs is not None:
-        colors = reference.color(reference.Gaussians(inputs["means3D"], None, None, shs, None, None, None, None),
-                                 settings)
-    inputs["colors_precomp"] = torch.cat([colors, features], 1)
-    results = list(results_of([name for name in names if name != feature],
-                              settings._replace(bg=pad(settings.bg, (0, features.shape[1]))), inputs))
-    place = [name for name in names if name != feature].index("color")
-    results[place], image = results[place].split([colors.shape[1], features.shape[1]])
-    results.insert(list(names).index(feature), image)
-    return tuple(results)
-
-
 def with_absolute(columns: int, inputs: Dict[str, Any]) -> Dict[str, Any]:
     """Returns the inputs with means2D_abs, so that the columns of means2D behind x and y get absolute sums.
 
-    columns: 2 for x and y, or 1 for the sum of both. A means2D without those columns is passed on as it is.
+    columns: 2 for x and y, or 1 for the sum of both. A means2D without those columns is passed on as it is; one with
+    four is always of 2.
     """
     points = inputs.get("means2D")
-    if not columns or points is None or points.shape[1] != 2 + columns:
+    columns = 2 if points is not None and points.shape[1] == 4 else columns
+    if points is None or points.shape[1] != 2 + columns:
         return inputs
     if not points.requires_grad:
         return {**inputs, "means2D": None}
@@ -147,6 +213,17 @@ def scaled_gradients(confidence: torch.Tensor, tensors: Dict[str, Any]) -> Dict[
         return tensor
 
     return {name: tensor if name == "means2D" else scaled(tensor) for name, tensor in tensors.items()}
+
+
+@torch.no_grad()
+def visible_filter(self, means3D, scales=None, rotations=None, cov3D_precomp=None):
+    """Returns the radii [N] int32 that a rendering would have, 0 for what the view does not see: a rasterizer's method.
+
+    means3D: [N, 3]; scales [N, 3] with rotations [N, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]` are
+    taken as they are. Which radii are 0 depends on the blend mode: the anchors need that of their rendering.
+    Raises ValueError or TypeError where arguments do not fit, as `rasterize` does.
+    """
+    return visible_radii(means3D, as_ours(self.raster_settings, {})[0], scales, rotations, cov3D_precomp)
 
 
 Renderer = Callable[[Settings, Dict[str, Any]], Tuple[torch.Tensor, ...]]
@@ -175,7 +252,7 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
         if densify is not None:  # one gradient of the image, which both receive
             inputs["means2D"] = densify if inputs["means2D"] is None else inputs["means2D"] + densify
         confidence = getattr(settings, "confidence", None)
-        inputs = with_absolute(entry.absolute, inputs)
+        inputs = with_absolute(2 if getattr(settings, "kernel_size", None) is None else 1, inputs)
         inputs = inputs if confidence is None else scaled_gradients(confidence, inputs)
         return renderer(settings, inputs) if renderer else results_of(entry.results, settings, inputs)
 
@@ -190,6 +267,8 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
             given = of_module.bind(*values, **named).arguments
             return render(given.pop("self").raster_settings, given)
 
+    if "visible_filter" in entry.methods:
+        GaussianRasterizer.visible_filter = visible_filter
     GaussianRasterizer.forward.__signature__ = of_module
     GaussianRasterizer.__doc__ = f"Renders as `rasterize`; used by {entry.used_by}.\n\nA call returns {returns}."
     rasterize_gaussians.__signature__ = of_function

@@ -36,11 +36,25 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "objects": ("[F, H, W], sh_objs blended as a colour over 0", "object"),
     "feature_map": ("[F, H, W], semantic_feature blended as a colour over 0", "feature"),
     "language_feature": ("[F, H, W], language_feature_precomp blended as a colour over 0", "feature"),
+    "normal": ("[3, H, W], normal_precomp blended as a colour over 0", "norm"),
 }
+FEATURES = {  # arguments [N, F] or [N, 1, F] that are blended beside the colours over 0: the result, and F without them
+    "sh_objs": ("objects", 0), "semantic_feature": ("feature_map", 0),
+    "language_feature_precomp": ("language_feature", 3), "normal_precomp": ("normal", 3)}
+# What a rasterizer of Inria's kind may have beside its results, in any combination.
+FREE_SETTINGS = ("antialiasing", "kernel_size", "subpixel_offset", "clamp_color", "confidence", "depth_threshold",
+                 "projmatrix_raw", "include_feature", "nearest_points")
+FREE_ARGUMENTS = ("means2D_densify", "theta", "rho", *FEATURES)
+FREE_METHODS = ("visible_filter",)
 
-# What names of results have in them, for callers of a rasterizer that returns these in an order of its own.
-WORDS = (("radii", "radi"), ("median_depth", "med.*depth|depth.*med"), ("inverse_depth", "inv.*depth"),
-         ("depth", "depth"), ("alpha", "alpha|opac|acc"), ("color", "image|colou?r|rgb|render|^im$"))
+# What callers name a result, without blanks, plural and the words of NO_MEANING: for those of a rasterizer that returns
+# results in an order of its own.
+WORDS = (("radii", "radi[ui]s?"), ("is_used", "(is)?used"), ("n_touched", "n?touched"),
+         ("median_depth", "med(ian)?depth|depthmed(ian)?"), ("inverse_depth", "inv(erse)?depth|depthinv"),
+         ("depth", "depth"), ("alpha", "alpha|opac(ity)?|acc(um(ulation)?)?"), ("normal", "norm(al)?"),
+         ("objects", "obj(ect)?"), ("feature_map", "(semantic)?feature|semantic"),
+         ("language_feature", "language(feature)?"), ("color", "colou?r|rgb|im|"))
+NO_MEANING = "rendered|rendering|render|image|img|map|pred|out(put)?|expected|blended|final|_"
 # What is in the names of packages that have Inria's names and compute something else: surfels, planes, opacity fields,
 # other lenses, rays of light or sound, other kernels.
 FOREIGN = ("surf", "plan", "gof", "^rade|_rade", "omni", "pano", "spher", "fisheye", "360", "op43", "ortho", "ray",
@@ -66,8 +80,6 @@ class Contract(NamedTuple):
     module: str = RASTERIZER  # what callers import
     other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings, or of a rasterizer beside it
     methods: Tuple[str, ...] = ()  # of a rasterizer, beside METHODS
-    absolute: int = 2  # columns of means2D behind x and y that get sums of absolute gradients, if there are so many:
-    # one for both axes, or one for each
 
 
 def _behind(name: str, *further: str) -> Tuple[str, ...]:
@@ -90,7 +102,7 @@ CONTRACTS = (
     Contract("taming", "Taming-3DGS", TAMING, ("pixel_weights",), WITH_DC, ("SparseGaussianAdam",),
              ("sets pixel_weights",)),
     Contract("mip_splatting", "Mip-Splatting, TRELLIS", settings=("kernel_size", "subpixel_offset"),
-             signs=("sets kernel_size",), absolute=1),
+             signs=("sets kernel_size",)),
     Contract("monogs", "MonoGS", ("color", "radii", "depth", "opacity", "n_touched"), ("projmatrix_raw",),
              (*ARGUMENTS, "theta", "rho"), signs=("sets projmatrix_raw",),
              other_results=(("color", "radii", "depth", "opacity"),)),
@@ -135,12 +147,12 @@ CONTRACTS = (
 def ordered(results: Tuple[str, ...]) -> Contract:
     """Returns the entry of a rasterizer like Inria's whose results come in another order: names of WORDS, each once.
 
-    Raises KeyError where they are others, or without `color` and `radii`.
+    Whatever is free may come with them. Raises KeyError where they are others, or without `color` and `radii`.
     """
     if len(set(results)) < len(results) or not {"color", "radii"} <= set(results) <= {name for name, _ in WORDS}:
         raise KeyError(",".join(results))
-    return Contract(",".join(results), "rasterizers whose results come in this order", results, ("antialiasing",),
-                    (*WITH_DC, "means2D_densify"))
+    return Contract(",".join(results), "rasterizers whose results come in this order", results, FREE_SETTINGS,
+                    (*ARGUMENTS, "dc", *FREE_ARGUMENTS), methods=FREE_METHODS)
 
 
 def contract_of(name: str) -> Contract:
