@@ -35,6 +35,23 @@ def test_every_link_of_a_page_leads_somewhere(stage):
     assert not missing
 
 
+def anchors(page):
+    """The anchors of a page's headings, as code hosts and the site make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = (re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", line) for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+    return {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
+def test_every_link_into_a_page_leads_to_a_heading(stage):
+    links = [(page, *link) for page in stage.markdown_files()
+             for link in re.findall(r"\]\(((?!https?:)[^)#\s]*)#([^)\s]+)\)", page.read_text(encoding="utf-8"))]
+    assert len(links) > 100
+    missing = [f"{page.relative_to(ROOT)}: {target}#{anchor}" for page, target, anchor in links
+               if (page.parent / target).suffix == ".md" and anchor not in anchors(page.parent / target)
+               or not target and anchor not in anchors(page)]
+    assert not missing
+
+
 def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
     from dsmoe.arguments import build_parser
 
