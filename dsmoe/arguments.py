@@ -87,7 +87,7 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
     render.add_argument("-o", "--output", metavar="DIR|VIDEO", required=True,
                         help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
-                             "that ends in .mp4 (needs imageio-ffmpeg) or .gif")
+                             "that ends in .mp4 (needs imageio-ffmpeg), .gif or .webp")
     render.add_argument("--orbit", action="store_true", help="once around what the scene's cameras look at")
     render.add_argument("--frames", type=int, default=choices.ORBIT_FRAMES, metavar="N",
                         help="of an orbit (default: %(default)s)")
