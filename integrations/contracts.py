@@ -1,8 +1,7 @@
 """The Python APIs of public Gaussian rasterizers, as data: how a trainer is recognised by them, and what is returned.
 
-From this table come the modules here, what `dsmoe run` answers for, how `dsmoe patch` tells trainers apart, and the
-table in README.md. A new rasterizer of Inria's kind is one entry, and a function in flavours.py where it does more. One
-that is imported by a name of its own also has a folder of that name in patches/shims.
+From this table come the classes of the modules here, what `dsmoe run` answers for, how `dsmoe patch` tells trainers
+apart, and the table in README.md. A new rasterizer of Inria's kind is one entry and one module.
 """
 from __future__ import annotations
 

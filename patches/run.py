@@ -1,8 +1,8 @@
 """`dsmoe run`: a command of an unmodified trainer, with this package's rasterizer in front of its own.
 
-PYTHONPATH names shims/, in which `diff_gaussian_rasterization` is the module of integrations whose API the trainer
-calls. DSMOE_BLEND_MODE is the mode, and in GATED_MODES DSMOE_BACKGROUND_GATE the background's gate. Whatever the
-command starts has them. That nothing was rendered is an error.
+PYTHONPATH names a folder that is written for this run. There `diff_gaussian_rasterization` is the module of
+integrations whose API the trainer calls. DSMOE_BLEND_MODE is the mode, and in GATED_MODES DSMOE_BACKGROUND_GATE the
+background's gate. Whatever the command starts has them. That nothing was rendered is an error.
 """
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MOD
 from dsmoe.system.children import die_with_parent
 
 from . import facts, kernels
-from .runtime import RASTERIZER_VARIABLE, SHIMS, STAND_INS, USED_VARIABLE, WITHOUT_VARIABLE
+from .runtime import RASTERIZER_VARIABLE, STAND_INS, USED_VARIABLE, WITHOUT_VARIABLE
 from .source import PatchError
 from .trainers import GR, OF_AUTHORS, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 RENAMED = "DSMOE_RUN_RENAMED"  # the names under which the trainer imports a rasterizer that is known
+AS_RASTERIZER = "from dsmoe.patches import runtime\nglobals().update(runtime.rasterizer_of_run({0!r}))\n"
+AS_GSPLAT = "from dsmoe.patches import runtime\nruntime.gsplat_of_run()\n"
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 
 
@@ -41,11 +43,9 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
     for line in lines:
         print("dsmoe run: " + line, file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
-        used = Path(folder, "used")
-        for name in filter(None, environment.pop(RENAMED, "").split(os.pathsep)):
-            Path(folder, "shims", name).mkdir(parents=True)
-            Path(folder, "shims", name, "__init__.py").write_text((SHIMS / RASTERIZER / "__init__.py").read_text())
-            environment["PYTHONPATH"] = os.pathsep.join([str(Path(folder, "shims")), environment["PYTHONPATH"]])
+        used, packages = Path(folder, "used"), Path(folder, "packages")
+        write_rasterizers(packages, list(filter(None, environment.pop(RENAMED, "").split(os.pathsep))))
+        environment["PYTHONPATH"] = os.pathsep.join([str(packages), environment["PYTHONPATH"]])
         try:
             child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)},
                                      preexec_fn=die_with_parent)
@@ -83,7 +83,7 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     if flavour == facts.OF_GSPLAT:  # unless what is beside it is known
         beside = facts.contract_of(found - {"from " + facts.OF_GSPLAT})[0]
         named = beside.name if beside and beside.module == RASTERIZER else named
-    path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
+    path = [str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: named,
                    BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
                    "PYTHONDONTWRITEBYTECODE": "1", RENAMED: os.pathsep.join(renamed)}  # no __pycache__ in the checkout
@@ -101,6 +101,18 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
     return environment, [f"{where}: {module} will be {flavour} of this package, blend mode {blend}; each process that "
                          "imports it says so", *(f"warning: {warning}" for warning in warnings)]
+
+
+def write_rasterizers(folder: Path, renamed: Sequence[str]) -> None:
+    """Makes the packages that a trainer imports as its rasterizer, each of one file, in a new folder.
+
+    renamed: further names, beside RASTERIZER, of the rasterizer that the trainer needs.
+    """
+    texts = {module: AS_RASTERIZER.format(contract.name) for module, contract in facts.MODULES.items()}
+    texts.update({name: AS_RASTERIZER.format("") for name in (RASTERIZER, *renamed)})
+    for name, text in {**texts, facts.OF_GSPLAT: AS_GSPLAT}.items():
+        (folder / name).mkdir(parents=True)
+        (folder / name / "__init__.py").write_text(text)
 
 
 def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script: Optional[Path]

@@ -10,7 +10,7 @@ import sys
 import types
 import warnings
 from pathlib import Path
-from typing import Any, Callable, Dict, Optional, Tuple
+from typing import Any, Callable, Dict, Tuple
 
 from diff_smoe_rasterization import settings
 from diff_smoe_rasterization.settings import (
@@ -22,7 +22,7 @@ from diff_smoe_rasterization.settings import (
     resolve_blend_mode,
 )
 
-SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
+STAND_INS = Path(__file__).resolve().parent / "stand_ins"
 OPTIONS = ("blend_mode", "background_gate")
 FAINT_EVERYWHERE = 2.0  # no gate sum is above 1
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
@@ -174,11 +174,11 @@ def _say_rasterizer(flavour: str) -> None:
         steps.register_optimizer_step_pre_hook(look)
 
 
-def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
+def rasterizer_of_run(flavour: str = "") -> Dict[str, Any]:
     """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
 
-    flavour: the module of integrations, where the name that is imported says it; None: the one that the trainer needs,
-        or what a call returns, with commas.
+    flavour: the module of integrations, if the name that is imported says it; else the one that the trainer needs, or
+        what a call returns, with commas.
     """
     from diff_smoe_rasterization import GaussianRasterizer
     from diff_smoe_rasterization.integrations._rasterizer import classes_of
@@ -232,7 +232,8 @@ def is_installed(module: str) -> bool:
     import torch  # noqa: F401  (its libraries are the extensions')
     name, path = module.partition(".")[0], sys.path[:]
     ours = sys.modules.pop(name)
-    sys.path[:] = [folder for folder in path if Path(folder).resolve() not in (SHIMS, STAND_INS)]
+    found_in = Path(str(ours.__file__)).resolve().parents[1]
+    sys.path[:] = [folder for folder in path if Path(folder).resolve() != found_in]
     try:
         importlib.import_module(module)
         return True

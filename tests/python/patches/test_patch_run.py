@@ -315,7 +315,8 @@ def test_a_folder_of_checkouts_is_told_which_they_are(tmp_path, monkeypatch):
 
 def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, python):
     modules = {contract.module: contract.name for contract in CONTRACTS
-               if contract.name in ("absgs", "fastgs", "mini_splatting")}
+               if contract.module not in ("diff_gaussian_rasterization", "gsplat")}
+    assert len(modules) == 4
     modules["diff_gaussian_rasterization"] = "inria"  # beside such a one, as Mini-Splatting's renderer has both
     script = "".join(f"from {module} import GaussianRasterizer, GaussianRasterizationSettings\n"
                      "GaussianRasterizer(None)\n" for module in modules)
@@ -490,14 +491,13 @@ def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_pa
     assert run.prepare(*words)
 
 
-def test_the_package_brings_the_shims_and_nothing_beside_itself():
-    """Not one of the names that the shims stand in for is installed as such."""
+def test_the_package_brings_the_stand_ins_and_nothing_beside_itself():
+    """Not one of the names that they stand in for is installed as such."""
     packages, data = packages_and_data()
     assert {name.partition(".")[0] for name in packages} == {"diff_smoe_rasterization", "dsmoe"}
     patches = ROOT / "dsmoe" / "patches"
     brought = {path for pattern in data["dsmoe.patches"] for path in patches.glob(pattern)}
-    for folder in ("shims", "stand_ins"):
-        assert set() != set((patches / folder).rglob("*.py")) <= brought
+    assert set() != set((patches / "stand_ins").rglob("*.py")) <= brought
     for contract in CONTRACTS:
         module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract.name}")
         names = NAMES if contract.module != "gsplat" else ("rasterization",)

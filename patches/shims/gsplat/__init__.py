@@ -1,3 +1,0 @@
-from dsmoe.patches.runtime import gsplat_of_run
-
-gsplat_of_run()
