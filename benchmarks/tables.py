@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 from pathlib import Path
 from typing import Any, Dict, Iterable, List, Sequence, Tuple
@@ -91,6 +92,26 @@ def budget_table(rows: Sequence[Row]) -> str:
                  (line for *_, line in sorted(lines)))
 
 
+def readme_table(rows: Sequence[Row]) -> str:
+    """A line for each scene and number of Gaussians, and for each scene by the recipe at 3DGS's threshold.
+
+    A PSNR is bold if it is higher by more than the sum of both deviations.
+    """
+    lines = []
+    chosen = (row for row in rows if row["budget"] or row["densify_grad_threshold"] == 0.0002)
+    for (scene, budget), cells in grouped(chosen, "scene", "budget").items():
+        blends = [grouped(cells, "blend_mode")[blend,] for blend in BLENDS]
+        spread = sum(statistics.stdev(row["psnr"] for row in found) if len(found) > 1 else math.inf for found in blends)
+        line = [f"{scene}, {f'N = {budget:,}' if budget else 'recipe'}"]
+        for found, other in zip(blends, blends[::-1]):
+            psnr, ssim = figures(found)
+            ahead = mean(found, "psnr") - mean(other, "psnr") > spread
+            line += [psnr.replace(psnr[:5], f"**{psnr[:5]}**") if ahead else psnr, ssim, thousands(found)]
+        lines.append((not budget, SCENES.index(scene), budget or 0, line))
+    return table(["", *(f"{blend}: PSNR" if name == "PSNR" else name for blend in BLENDS
+                        for name in ("PSNR", "SSIM", "Gaussians"))], (line for *_, line in sorted(lines)))
+
+
 def recipe_table(rows: Sequence[Row]) -> str:
     """A line for each scene and threshold."""
     lines = []
@@ -164,7 +185,7 @@ def main() -> None:
     parser.add_argument("--figure", metavar="PNG", help="draw it here")
     options = parser.parse_args()
     rows = trainings()
-    for text in (budget_table(rows), recipe_table(rows), rules_table()):
+    for text in (readme_table(rows), budget_table(rows), recipe_table(rows), rules_table()):
         print(text, end="\n\n")
     if options.figure:
         draw(options.figure)
