@@ -59,7 +59,7 @@ class Batch:
         self.group, self.model = group, model
         self.owners = [view % group.size for view in range(len(settings))]
         self.own_views = [view for view, owner in enumerate(self.owners) if owner == group.rank]
-        # In which views lie side by side in what is sent: those of one receiver together.
+        # Order of the views in the send buffer: grouped by receiver.
         self._order = sorted(range(len(settings)), key=lambda view: self.owners[view])
         self._values = model.activated()
         opacities, scales, rotations = self._values
