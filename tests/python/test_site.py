@@ -260,3 +260,14 @@ def test_every_page_has_the_version_of_the_package():
                                  ("CHANGELOG.md", r"^## (.*)$", 1)):
         found = re.findall(pattern, (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
         assert found[:times] == [__version__] * times, f"{page}: {found}"
+
+
+def test_the_first_table_of_the_readme_has_rows_of_the_results():
+    rows = re.findall(r"^\| (.*?) \| ([\d.]+) \| ([\d,]+)", README.read_text(encoding="utf-8"), re.MULTILINE)[:5]
+    results = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    table = results.partition("## Trainers side by side")[2].partition("\n## ")[0]
+    assert len(rows) == 5
+    for name, seconds, number in rows:
+        short = f"{int(number.replace(',', '')) / 1000:.0f}k"
+        assert any(re.search(rf"\b{seconds}\b", line) and (short in line or "1.03 M" in line)
+                   for line in table.splitlines() if line.startswith("|")), f"{name}: {seconds} s, {short}"
