@@ -13,9 +13,11 @@ import torch
 from diff_smoe_rasterization.autograd import INPUTS
 from diff_smoe_rasterization.footprints import GATE_GRADIENTS, Footprints, blend_op_arguments, projection_arguments
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
+from diff_smoe_rasterization.splats import Splats
 
 from ..model import PARAMETERS, GaussianModel
 from ..system.group import Group
+from ..training.strategy import Look
 
 _OPS = torch.ops.diff_smoe_rasterization
 _GATE = 8  # numbers of a footprint before its features
@@ -41,6 +43,13 @@ class DrawnImage:
         *images, self._saved = _OPS.blend(*self._tensors, *self._options)
         self._images = images
         self.color: torch.Tensor = images[0]  # [C, H, W]
+
+    def splats(self) -> Splats:
+        """What the pixels say of each footprint."""
+        color, gate_sum, *_ = self._images
+        inputs = dict(zip(("radii", "bg", "background_gate"), self._tensors[2:]))
+        return Splats([color, self.radii, gate_sum], self._saved, [inputs.get(name) for name in INPUTS],
+                      self._options[:-1])
 
     def backward(self, dL_dcolor: torch.Tensor, wants_gate: bool) -> Tuple[torch.Tensor, torch.Tensor]:
         """Gradients by the footprints, [M, 6 + F], and by the background's gate, [1], or [0] where it is not wanted."""
@@ -80,14 +89,15 @@ class Batch:
             self._arrived = {view: [rows] for view, rows in enumerate(packed)}
         else:
             outgoing = joined([packed[view] for view in self._order])
-            self._arrived = self._split(group.exchange(outgoing, *self._lengths()))
+            self._arrived = self._split(group.exchange(outgoing, *self._lengths(self._order)))
 
-    def _lengths(self) -> Tuple[List[int], List[int]]:
-        """How many rows go to each process, and how many come from each."""
+    def _lengths(self, views: Sequence[int]) -> Tuple[List[int], List[int]]:
+        """How many rows of footprints of these views go to each process, and how many come from each."""
         group = self.group
-        sent = [sum(self._counts[view][group.rank] for view, owner in enumerate(self.owners) if owner == rank)
+        sent = [sum(self._counts[view][group.rank] for view in views if self.owners[view] == rank)
                 for rank in range(group.size)]
-        received = [sum(self._counts[view][rank] for view in self.own_views) for rank in range(group.size)]
+        received = [sum(self._counts[view][rank] for view in views if view in self.own_views)
+                    for rank in range(group.size)]
         return sent, received
 
     def _split(self, rows: torch.Tensor) -> Dict[int, List[torch.Tensor]]:
@@ -108,17 +118,37 @@ class Batch:
 
         The records are taken out of `records`.
         """
-        if self.group.size == 1:
-            return [records.pop(view) for view in range(len(self.owners))]
-        by_view = {view: records.pop(view).split(list(self._counts[view])) for view in self.own_views}
-        parts = [by_view[view][rank] for rank in range(self.group.size) for view in self.own_views]
-        sent, received = self._lengths()
         width = GATE_GRADIENTS + self.projected[0].features.shape[1]
+        return self._return(records, range(len(self.owners)), width)
+
+    def looks(self, own: Dict[int, Look], views: Sequence[int]) -> List[Look]:
+        """From looks at own views, at their footprints, to looks at these views, at the own Gaussians."""
+        rows = {view: torch.stack(look, 1) for view, look in own.items()}
+        looks: List[Look] = []
+        for view, part in zip(views, self._return(rows, views, len(Look._fields))):
+            projected = self.projected[view]
+            dense = part.new_zeros((len(projected.radii), part.shape[1]))
+            dense.index_copy_(0, projected.visible, part)
+            looks.append(Look(*dense.unbind(1)))
+        return looks
+
+    def _return(self, rows: Dict[int, torch.Tensor], views: Sequence[int], width: int) -> List[torch.Tensor]:
+        """From rows [M, width] for the footprints of each own view to rows for the own footprints of these views.
+
+        views: the same in all processes, rising. The rows are taken out of `rows`.
+        """
+        if self.group.size == 1:
+            return [rows.pop(view) for view in views]
+        own = [view for view in self.own_views if view in views]
+        by_view = {view: rows.pop(view).split(list(self._counts[view])) for view in own}
+        parts = [by_view[view][rank] for rank in range(self.group.size) for view in own]
+        order = [view for view in self._order if view in views]
+        sent, received = self._lengths(order)
         outgoing = joined(parts) if parts else self.projected[0].features.new_empty((0, width))
         del by_view, parts
         returned = self.group.exchange(outgoing, received, sent)
-        pieces = returned.split([self._counts[view][self.group.rank] for view in self._order])
-        return [piece for _, piece in sorted(zip(self._order, pieces), key=lambda pair: pair[0])]
+        pieces = returned.split([self._counts[view][self.group.rank] for view in order])
+        return [piece for _, piece in sorted(zip(order, pieces), key=lambda pair: pair[0])]
 
     def backward(self, records: List[torch.Tensor]) -> List[torch.Tensor]:
         """Sets the gradients of the model's parameters, sums over the views in their order.

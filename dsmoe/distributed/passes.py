@@ -1,17 +1,18 @@
 """The passes of a step over a batch of views, with the Gaussians divided over the processes of a group."""
 from __future__ import annotations
 
-from typing import Callable, Dict, Optional, Sequence
+from typing import Callable, Dict, Iterator, Optional, Sequence
 
 import torch
 
 from ..model import GaussianModel
 from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer
+from ..scenes.images import View
 from ..system.group import Group
 from ..training.background_gate import LearnedGate
 from ..training.passes import Compare, Passes, ViewOver
-from ..training.strategy import Step
+from ..training.strategy import Look, Step, look_at
 from .batch import Batch
 
 
@@ -26,17 +27,20 @@ class BatchPasses(Passes):
         self._batch: Optional[Batch] = None
 
     @torch.no_grad()
-    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> Step:
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()) -> Step:
         settings = [self.renderer.settings_of(shown.view.camera, shown.background) for shown in views]
         batch = self._batch = Batch(self.group, self.model, settings, note=int(self.wants_stop()))
         self.asked = any(batch.notes)
         # Losses, and gradients by the background's gate.
         numbers = torch.zeros(2, len(views), device=self.model.raw["means3D"].device)
         self._records: Dict[int, torch.Tensor] = {}
+        looks: Dict[int, Look] = {}
 
         def blend(view: int) -> None:  # what one view has saved is gone before the next one is blended
             drawn = batch.draw(view, settings[view])
-            _, loss, gradient = compare(views[view], drawn.color)
+            target, loss, gradient = compare(views[view], drawn.color)
+            if view in looked:
+                looks[view] = look_at(views[view].view, target, drawn.color, drawn.splats())
             self._records[view], dL_dgate = drawn.backward(gradient, self.gate is not None)
             numbers[0, view] = loss
             if self.gate:
@@ -46,7 +50,22 @@ class BatchPasses(Passes):
             blend(view)
         self.group.add_up(numbers)
         losses, self._dL_dgates = numbers
-        return Step(iteration, len(views), losses.mean())
+        step = Step(iteration, len(views), losses.mean(), self._add_gradient)
+        if looked:
+            step.looks += batch.looks(looks, looked)
+        return step
+
+    @torch.no_grad()
+    def look(self, views: Sequence[View]) -> Iterator[Look]:
+        for first in range(0, len(views), self.group.size):
+            some = views[first:first + self.group.size]
+            settings = [self.renderer.settings_of(view.camera) for view in some]
+            batch = Batch(self.group, self.model, settings)
+            looks: Dict[int, Look] = {}
+            for index in batch.own_views:
+                drawn = batch.draw(index, settings[index], for_backward=False)
+                looks[index] = look_at(some[index], some[index].image, drawn.color, drawn.splats())
+            yield from batch.looks(looks, range(len(some)))
 
     @torch.no_grad()
     def backward(self, step: Step) -> None:

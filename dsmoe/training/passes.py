@@ -7,7 +7,7 @@ seen, and repeats steps as CUDA graphs. `BatchPasses`, in distributed/passes.py,
 from __future__ import annotations
 
 import weakref
-from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import torch
 
@@ -26,7 +26,7 @@ from ..scenes.cameras import Camera
 from ..scenes.images import View
 from .background_gate import LearnedGate
 from .graphs import Captured, Graphs, NoGraphs
-from .strategy import Step, ViewStep
+from .strategy import Look, Step, ViewStep, look_at
 
 _OPS = torch.ops.diff_smoe_rasterization
 ACTIVATED = ("opacities", "scales", "rotations")
@@ -52,8 +52,8 @@ class Passes:
         """gate: the background's, where it is learned."""
         self.model, self.optimizer, self.renderer, self.gate = model, optimizer, renderer, gate
 
-    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> Step:
-        """Renders the views of the step that ends with this iteration, and compares them."""
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()) -> Step:
+        """Renders the views of the step that ends with this iteration, compares them, and looks at some of them."""
         raise NotImplementedError
 
     def backward(self, step: Step) -> None:
@@ -64,29 +64,42 @@ class Passes:
         """Steps the parameters that have not been replaced since `render`."""
         raise NotImplementedError
 
+    def look(self, views: Sequence[View]) -> Iterator[Look]:
+        """Renders views beside the steps, and looks at each."""
+        for view in views:
+            rendering, splats = self.renderer.with_splats(view.camera)
+            yield look_at(view, view.image, rendering.color, splats)
+
+    @torch.enable_grad()
+    def _add_gradient(self, name: str, number: float) -> None:
+        """Adds a number to the gradient by every opacity, scale or rotation (the parameter's name); after backward."""
+        value = self.model.activated()[ACTIVATED.index(name)]
+        value.backward(torch.full_like(value, number))
+
 
 class AutogradPasses(Passes):
     """The passes as torch knows them."""
 
-    _seen: Optional[Callable[[], Splats]] = None
-
-    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> ViewStep:
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()
+               ) -> ViewStep:
         (shown,) = views
-        rendering, self._means2D = self._draw(shown.view.camera, shown.background)
+        rendering, self._means2D, splats = self._draw(shown.view.camera, shown.background)
         target, loss, self._dL_dcolor = compare(shown, rendering.color.detach())
-        return ViewStep(iteration, 1, loss, shown.view, target, rendering, self._splats, self._add_gradient)
+        step = ViewStep(iteration, 1, loss, self._add_gradient, shown.view, target, rendering)
+        step.looks += [look_at(shown.view, target, rendering.color, splats()) for _ in looked]
+        return step
 
     def backward(self, step: Step) -> None:
         assert isinstance(step, ViewStep)
-        self._seen = None  # which holds on to memory, as what is deleted below
         self._color.backward(self._dL_dcolor)
         gradient = self._means2D.grad
         assert gradient is not None
         step.seen.append((gradient, step.rendering.radii))
-        del self._means2D, self._dL_dcolor, self._color
+        del self._means2D, self._dL_dcolor, self._color  # which hold on to memory
 
-    def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
-        """The image, and a tensor [N, 3] whose .grad `backward` sets where radii > 0.
+    def _draw(self, camera: Camera, background: Optional[torch.Tensor]
+              ) -> Tuple[Rendering, torch.Tensor, Callable[[], Splats]]:
+        """The image, a tensor [N, 3] whose .grad `backward` sets where radii > 0, and what the image says of each.
 
         background: in place of the renderer's.
         """
@@ -98,23 +111,11 @@ class AutogradPasses(Passes):
         view = (camera, background, gate)
         if self.renderer.rasterize is package_rasterizer():
             rendering, splats = self.renderer.with_splats(*view, means2D=means2D)
-            self._seen = lambda: splats
-        else:
-            rendering = self.renderer(*view, means2D=means2D)
-            self._seen = lambda: self.renderer.with_splats(*view)[1]
+            self._color = rendering.color
+            return rendering, means2D, lambda: splats
+        rendering = self.renderer(*view, means2D=means2D)
         self._color = rendering.color
-        return rendering, means2D
-
-    def _splats(self) -> Splats:
-        """What the image of `_draw` says of each Gaussian."""
-        assert self._seen is not None, "render comes first"
-        return self._seen()
-
-    @torch.enable_grad()
-    def _add_gradient(self, name: str, number: float) -> None:
-        """Adds a number to the gradient by every opacity, scale or rotation (the parameter's name); after backward."""
-        value = self.model.activated()[ACTIVATED.index(name)]
-        value.backward(torch.full_like(value, number))
+        return rendering, means2D, lambda: self.renderer.with_splats(*view)[1]
 
     def update(self) -> None:
         self.optimizer.step()
@@ -150,7 +151,8 @@ class DirectPasses(Passes):
         self._numbers = model.stored["means3D"].new_zeros(1 + 2 * len(PARAMETERS))
 
     @torch.no_grad()
-    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> ViewStep:
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()
+               ) -> ViewStep:
         (shown,) = views
         stored, lazy = self.model.stored, self.optimizer.lazy_colors()
         # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
@@ -172,8 +174,9 @@ class DirectPasses(Passes):
         lazy.end()
         drawn = self._drawn
         self._radii = self._stepped = drawn.rendering.radii
-        return ViewStep(iteration, 1, drawn.loss, shown.view, drawn.target, drawn.rendering, drawn.direct.splats,
-                        self._add_gradient)
+        step = ViewStep(iteration, 1, drawn.loss, self._add_gradient, shown.view, drawn.target, drawn.rendering)
+        step.looks += [look_at(shown.view, drawn.target, drawn.rendering.color, drawn.direct.splats()) for _ in looked]
+        return step
 
     @torch.no_grad()
     def backward(self, step: Step) -> None:

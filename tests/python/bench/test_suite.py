@@ -127,7 +127,6 @@ def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
     ({"protocol": {"iterations": 0}}, ["protocol.iterations"]),
     ({"protocol": {"gpus": 2, "device": "cpu"}}, ["protocol.gpus is 2; it needs protocol.device: cuda"]),
     ({"protocol": {"gpus": 2}, "methods": [{"name": "3dgs-2023", "path": "x"}]}, ["method 3dgs-2023 knows none"]),
-    ({"protocol": {"batch": 2}, "strategies": ["mcmc"]}, ["protocol.batch is 2, but strategy mcmc knows none"]),
     ({"protocol": {"batch": 7}}, ["--iterations is 30000; it must be a multiple of --batch, 7"]),
     ({"protocol": {"options": {"densify_until": 1}}}, ["protocol.options", "densify_until"]),
     ({"protocol": {"options": {"lambda_dssim": 2}}}, ["--lambda-dssim", "2"]),
