@@ -203,8 +203,8 @@ class TrainConfig:
     def changed(self, **options: Any) -> TrainConfig:
         """A validated copy with some options set.
 
-        Another blend mode takes its own background gate, also of how that is learned what is at its default. Another
-        strategy takes what of the recipe is at its default and its own options.
+        Another blend mode brings its default gate, and its defaults of learning one in place of the old mode's. Another
+        strategy brings its defaults of the recipe in place of the old one's, and drops the old one's own options.
         """
         return self._changed(options).validate()
 

@@ -73,7 +73,7 @@ class Batch:
         self.group = group
         self.owners = [view % group.size for view in range(len(settings))]
         self.own_views = [view for view, owner in enumerate(self.owners) if owner == group.rank]
-        # In which views lie side by side in what is sent: those of one receiver together.
+        # Order of the views in the send buffer: grouped by receiver.
         self._order = sorted(range(len(settings)), key=lambda view: self.owners[view])
         self.projected: List[Projected] = []
         packed: List[torch.Tensor] = []
