@@ -18,7 +18,7 @@ import torch
 
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, GATED_MODES
 
-from ...config import TrainConfig
+from ...config import LEARNED, TrainConfig
 from ...results.evaluation import Evaluation, summary
 from ...results.pictures import evenly_spaced
 from ...scenes.images import View
@@ -254,7 +254,9 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
                    train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
                    are_gaussians=shape.of_gaussians,
                    commit=shape.method.get("commit") or commit_of(shape.method["path"]), renders=renders,
-                   notes={"ground_truth_difference": difference, **shape.rules()})
+                   notes={"ground_truth_difference": difference, **shape.rules(),
+                          **({"background_gate": rendered["background_gate"]} if config.background_gate == LEARNED
+                             else {})})
 
 
 def portable(words: List[str]) -> List[str]:
