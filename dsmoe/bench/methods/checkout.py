@@ -20,6 +20,7 @@ from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MOD
 
 from ...config import LEARNED, TrainConfig
 from ...results.evaluation import Evaluation, summary
+from ...patches.runtime import STAND_INS
 from ...results.pictures import evenly_spaced
 from ...scenes.images import View
 from ...scenes.scene import Scene
@@ -138,7 +139,9 @@ class ThreeDGS:
 
     def environment(self) -> Dict[str, str]:
         ours = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-        path = [item for item in [*self.method["pythonpath"], *ours] if item]
+        # The observer imports the trainer's modules before the script has called modernise.start().
+        stand_ins = [str(STAND_INS)] * (self.method["variant"] != "unpatched")
+        path = [item for item in [*self.method["pythonpath"], *ours, *stand_ins] if item]
         environment = {name: value for name, value in os.environ.items()
                        if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, "PYTHONSAFEPATH")}
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
