@@ -19,8 +19,8 @@ import torch
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, GATED_MODES
 
 from ...config import LEARNED, TrainConfig
-from ...results.evaluation import Evaluation, summary
 from ...patches.runtime import STAND_INS
+from ...results.evaluation import Evaluation, summary
 from ...results.pictures import evenly_spaced
 from ...scenes.images import View
 from ...scenes.scene import Scene
