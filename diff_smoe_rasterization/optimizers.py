@@ -58,7 +58,7 @@ class FusedAdam(torch.optim.Adam):
 
 
 def corrected_rates(group: Dict[str, Any], step: int) -> Tuple[float, float]:
-    """The rate and the root scale (include/dsmoe/adam.h) of a group's step number `step`, 1 in the first."""
+    """The rate and the root scale (include/dsmoe/training/adam.h) of a group's step number `step`, 1 in the first."""
     beta1, beta2 = group["betas"]
     return group["lr"] / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
 
@@ -112,7 +112,7 @@ class _Launch:
         self.root_scales: List[float] = []
 
     def add(self, parameter: torch.Tensor, state: Dict[str, Any], rate: float, root_scale: float) -> None:
-        """rate, root_scale: as in include/dsmoe/adam.h."""
+        """rate, root_scale: as in include/dsmoe/training/adam.h."""
         self.parameters.append(parameter)
         self.gradients.append(parameter.grad)
         self.moments.append(state["exp_avg"])

@@ -23,7 +23,7 @@ class CommandLine {
   bool has(const std::string& name) const { return values_.count(name) != 0; }
   const std::vector<std::string>& arguments() const { return arguments_; }  // that belong to no option
 
-  // Each returns `missing` where the option is absent.
+  // Each returns `missing` if the option is absent.
   std::string text(const std::string& name, const std::string& missing) const;
   double number(const std::string& name, double missing, double least, double most) const;
   int whole(const std::string& name, int missing, int least, int most) const;

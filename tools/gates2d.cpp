@@ -6,8 +6,8 @@
 #include <random>
 #include <thread>
 
-#include "dsmoe/adam_tensors.h"
 #include "dsmoe/tiles.h"
+#include "dsmoe/training/adam.h"
 
 namespace dsmoe::tools {
 namespace {

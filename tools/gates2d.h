@@ -54,7 +54,7 @@ Drawing draw(const Mixture2d& model, int num_threads);
 /// The gates at a pixel, [K]; for the weighted sum the kernels G.
 std::vector<double> gates_at(const Mixture2d& model, int x, int y);
 
-/// The mean squared error against `target` [3, H, W], and its gradient by each kernel. Where kernels share a parameter,
+/// The mean squared error against `target` [3, H, W], and its gradient by each kernel. If kernels share a parameter,
 /// each gets the sum; what their shape does not have gets 0. The result does not depend on num_threads.
 double loss_and_gradient(const Mixture2d& model, const std::vector<float>& target, int num_threads,
                          std::vector<Kernel>& gradient);

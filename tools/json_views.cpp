@@ -74,7 +74,7 @@ struct Node {
 
 using Rotation = std::array<double, 9>;
 
-/// Throws where the rows are not those of a rotation.
+/// Throws if the rows are not those of a rotation.
 void check_rotation(const Node& node, const Rotation& r) {
   const auto row = [&](int i) { return Vector{r[3 * i], r[3 * i + 1], r[3 * i + 2]}; };
   const auto dot = [](const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; };

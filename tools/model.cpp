@@ -8,7 +8,7 @@
 #include <utility>
 
 #include "dsmoe/blend.h"
-#include "dsmoe/gaussians.h"
+#include "dsmoe/training/gaussians.h"
 #include "errors.h"
 #include "io/cursor.h"
 #include "io/splat.h"

@@ -27,13 +27,13 @@ struct Model {
 
 Model activated(io::GaussianModel raw);
 
-/// Reads a .ply of Inria's layout or a .splat, by its name. Throws io::IoError, also where no Gaussian is finite.
+/// Reads a .ply of Inria's layout or a .splat, by its name. Throws io::IoError, also if no Gaussian is finite.
 io::GaussianModel read_model(const std::string& path);
 
 std::vector<std::string> blend_names();
 
-/// The blend that a file records, or the one that is asked for (empty, nullopt: nothing is). Notes go to stderr where
-/// they disagree, and where a file has an older name. Throws UsageError where neither says.
+/// The blend that a file records, or the one that is asked for (empty, nullopt: nothing is). Notes go to stderr if
+/// they disagree, and if a file has an older name. Throws UsageError if neither says.
 BlendRules<double> choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
                                 std::optional<double> background_gate);
 

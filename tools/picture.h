@@ -50,10 +50,10 @@ struct Curve {
 /// Curves over their index, with axes and a legend; heights from `low` to `high`.
 Picture plot(const std::vector<Curve>& curves, float low, float high);
 
-/// An .mp4: H.264 where this OpenCV has it, else MPEG-4.
+/// An .mp4: H.264 if this OpenCV has it, else MPEG-4.
 class VideoFile {
  public:
-  /// Throws std::runtime_error where it cannot be written.
+  /// Throws std::runtime_error if it cannot be written.
   VideoFile(const std::string& path, int width, int height, double frames_per_second);
   ~VideoFile();
   VideoFile(const VideoFile&) = delete;

@@ -93,7 +93,7 @@ const std::vector<OptionRule> kOptions = {{"help", 'h', false},
 
 constexpr int kLargestSide = 16384;  // pixels of a picture; a typing error is not to take all memory
 
-/// "W" or "WxH"; zeros where it is absent, a height of 0 where it is not said.
+/// "W" or "WxH"; zeros if it is absent, a height of 0 if it is not said.
 ImageSize read_size(const CommandLine& line) {
   if (!line.has("size")) return {};
   ImageSize size;
@@ -196,7 +196,7 @@ class Painter {
     return colors;
   }
 
-  /// Stays empty where the picture is.
+  /// Stays empty if the picture is.
   void find_span(const std::vector<float>& numbers, const std::vector<float>& alpha) {
     for (std::size_t i = 0; i < alpha.size(); ++i) {
       if (!(alpha[i] > 0)) continue;

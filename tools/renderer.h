@@ -25,7 +25,7 @@ struct Images {
   int width = 0, height = 0;
   std::vector<float> color;        // [3, H, W]
   std::vector<float> alpha;        // [H, W] the gate sum
-  std::vector<float> depth;        // [H, W] world; 0 where there is no Gaussian
+  std::vector<float> depth;        // [H, W] world; 0 if there is no Gaussian
   std::vector<int32_t> gaussians;  // [H, W] the one of the greatest gate, or -1
   std::vector<int32_t> counts;     // [H, W] Gaussians that were blended
 };
@@ -39,7 +39,7 @@ class Renderer {
 /// `model` must outlive the renderer.
 std::unique_ptr<Renderer> make_cpu_renderer(const Model& model, const RenderOptions& options);
 
-/// On the current GPU. Throws std::runtime_error where there is none, and where this build has no CUDA.
+/// On the current GPU. Throws std::runtime_error if there is none, and if this build has no CUDA.
 std::unique_ptr<Renderer> make_cuda_renderer(const Model& model, const RenderOptions& options);
 bool has_cuda_renderer();
 

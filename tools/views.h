@@ -31,7 +31,7 @@ std::vector<View> read_views(const std::string& path, ImageSize size);
 std::vector<View> views_of(const io::ColmapModel& model, const std::string& folder);
 
 /// The bytes of a json file, which `file` names in errors: a list is a cameras.json, an object a transforms.json.
-/// Throws FormatError, also where neither the file nor `size` says how large the images are.
+/// Throws FormatError, also if neither the file nor `size` says how large the images are.
 std::vector<View> parse_json_views(std::string_view bytes, const std::string& file, ImageSize size);
 
 struct Orbit {
@@ -44,7 +44,7 @@ struct Orbit {
   int width = 1280, height = 720;            // pixels
 };
 
-/// Views on a circle around the target. Throws std::invalid_argument where `up` is zero.
+/// Views on a circle around the target. Throws std::invalid_argument if `up` is zero.
 std::vector<View> orbit_views(const Orbit& orbit);
 
 }  // namespace dsmoe::tools

@@ -1,5 +1,5 @@
 // The CPU backend's stages under Google Benchmark: projection, tile lists (which sorts), blending and its backward pass
-// in each mode, and the projection's backward pass. Built as dsmoe_benchmarks where the library is found.
+// in each mode, and the projection's backward pass. Built as dsmoe_benchmarks if the library is found.
 //
 //     build/cpp/tests/cpp/dsmoe_benchmarks --benchmark_filter='Blend.*/smoe/' --benchmark_repetitions=5
 //

@@ -16,7 +16,7 @@ int64_t most_instances();
 // Whether stage times are taken.
 void set_profiling(bool enabled);
 
-// Of the latest forward pass, and of the latest backward pass; zeros where there was none.
+// Of the latest forward pass, and of the latest backward pass; zeros if there was none.
 StageTimes stage_times();
 
 enum class Pass { kForward, kBackward };

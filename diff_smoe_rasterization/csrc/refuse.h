@@ -21,7 +21,7 @@ template <class... Parts> [[noreturn]] void refuse(const char* function, const P
   throw std::invalid_argument(message.str());
 }
 
-// size: 0 where the array has no elements.
+// size: 0 if the array has no elements.
 inline void refuse_null(const char* function, const char* name, const void* array, const char* shape, int64_t size) {
   if (array == nullptr && size > 0) refuse(function, name, " is null; it must point to an array ", shape);
 }
@@ -51,7 +51,7 @@ template <class S> void refuse_unless_finite_but(int column, const char* functio
 
 constexpr int kUnreadViewColumn = 3, kUnreadClipColumn = 2;  // (0, 0, 0, 1), and clip z
 
-// Whether the host may read what the pointers of a frame point to: where the camera holds its matrices.
+// Whether the host may read what the pointers of a frame point to: if the camera holds its matrices.
 template <class Frame> constexpr bool kOnHost = !std::is_pointer_v<decltype(Frame::camera.view)>;
 
 // The shape of saved.features.
@@ -122,7 +122,7 @@ template <class S> void refuse_given(const char* function, const GaussianInputs<
   }
 }
 
-// Gaussians that do not say what a projection needs. Where there are none, null does not tell what is given.
+// Gaussians that do not say what a projection needs. If there are none, null does not tell what is given.
 template <class S> void refuse_inputs(const char* function, const GaussianInputs<S>& inputs, int num_channels) {
   if (inputs.num_gaussians == 0) return;
   refuse_null(function, "means3D", inputs.means3D, "[N, 3]", 1);

@@ -5,11 +5,10 @@
 #include <initializer_list>
 #include <vector>
 
-#include "dsmoe/adam_tensors.h"
-#include "dsmoe/gather.h"
-#include "dsmoe/gaussian_adam.h"
-#include "dsmoe/image_loss.h"
-#include "dsmoe/lazy_adam.h"
+#include "dsmoe/training/adam.h"
+#include "dsmoe/training/gather.h"
+#include "dsmoe/training/gaussians.h"
+#include "dsmoe/training/image_loss.h"
 #include "refuse.h"
 
 namespace dsmoe {

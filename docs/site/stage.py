@@ -22,7 +22,7 @@ IO = ROOT / "diff_smoe_rasterization" / "csrc" / "io"
 # The headers in the order in which one reads them; others follow by name.
 FIRST = ("rasterize.h", "rasterize_cuda.h", "params.h", "allocator.h", "torch.h")
 DEMO = "DSMOE_DEMO"  # names the page of `dsmoe export` that the site shows; the repository holds no model
-IO_HEADERS = ("ply.h", "point_cloud.h", "colmap.h")
+IO_HEADERS = ("ply.h", "colmap.h")
 
 
 def main(folder: Path) -> None:

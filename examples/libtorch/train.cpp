@@ -15,7 +15,7 @@ struct Blend {
   std::string mode;
   bool has_gate;
   double number = 0, bound, start, rate;
-  std::vector<dsmoe::AdamParameter> logarithm;  // p, where it is learned
+  std::vector<dsmoe::AdamParameter> logarithm;  // p, if it is learned
 
   Blend(const std::string& mode, const std::string& gate, torch::Device device)
       : mode(mode),

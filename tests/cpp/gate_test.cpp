@@ -72,7 +72,7 @@ template <BlendMode kMode, class S> void expect_squared_reach_is_exact(S margin)
   EXPECT_GT(without, 10);
 }
 
-// A pair that counts is near where alpha >= 1/255, and within 3 sigma where alpha >= 1/1020: by the least alpha, by the
+// A pair that counts is near if alpha >= 1/255, and within 3 sigma if alpha >= 1/1020: by the least alpha, by the
 // reach, and as kernels ask.
 template <BlendMode kMode, class S> void expect_near_pairs(S margin) {
   int near_pairs = 0, faint_pairs = 0;
@@ -144,7 +144,7 @@ TYPED_TEST(GateOfMode, LogGateIsTheGate) {
   expect_log_gate_is_the_gate<TypeParam::value>(1e-12, 4e-14);
 }
 
-// Where the form is no ellipse the exponent may be positive: such a pair does not count, and has no infinite gate that
+// If the form is no ellipse the exponent may be positive: such a pair does not count, and has no infinite gate that
 // matters. Nor does a pair of a Gaussian that reaches no pixel.
 TYPED_TEST(GateOfMode, LogGateLeavesOutPositiveExponents) {
   const LogGate<double> no_ellipse({0.5, 2.0, 0.5}, 0.9, 11.0);

@@ -1,5 +1,5 @@
 // Rows by a list.
-#include "dsmoe/gather.h"
+#include "dsmoe/training/gather.h"
 
 #include <gtest/gtest.h>
 

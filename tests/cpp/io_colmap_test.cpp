@@ -268,7 +268,7 @@ TEST(ColmapErrors, OfTextFilesNameLineAndReason) {
   expect_error(points, "1 0 0 inf 1 2 3 0", "coordinate inf");
   expect_error(points, "1 0 0 0 256 2 3 0", "colour is \"256\"");
   expect_error(points, "1 0 0 0 1 2 3", "error is missing");
-  // Where an editor dropped the empty lines of observations, the next image must not be taken for one.
+  // If an editor dropped the empty lines of observations, the next image must not be taken for one.
   const std::string no_empty_lines = "1 1 0 0 0 0 0 0 1 a.jpg\n2 1 0 0 0 0 0 0 1 b.jpg\n";
   expect_contains(format_error_of([&] { images(no_empty_lines); }), "line 2: the line of observations");
 }

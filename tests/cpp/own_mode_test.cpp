@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "cpu/tile_loop.h"
+#include "cpu/loops.h"
 #include "dsmoe/removal.h"
 #include "refusal.h"
 #include "refuse.h"

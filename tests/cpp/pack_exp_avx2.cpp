@@ -1,4 +1,4 @@
-// The packs' exponential for AVX2. Empty where the target is not x86-64.
+// The packs' exponential for AVX2. Empty if the target is not x86-64.
 #if defined(__x86_64__)
 
 #include <cmath>

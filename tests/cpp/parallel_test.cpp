@@ -133,7 +133,7 @@ TEST(RunThreads, TakesNoProcessorTimeBetweenCalls) {
   threads_that_meet(4);
   const std::clock_t start = std::clock();
   std::this_thread::sleep_for(std::chrono::milliseconds(300));
-  // Three threads that waited busily would take 900 ms of processor time where there are as many cores, 300 on one.
+  // Three threads that waited busily would take 900 ms of processor time if there are as many cores, 300 on one.
   EXPECT_LT(double(std::clock() - start) / CLOCKS_PER_SEC, 0.1);
 }
 

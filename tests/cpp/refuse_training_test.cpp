@@ -1,7 +1,7 @@
 // What the trainers' functions refuse, and what their messages say.
 #include "refuse_training.h"
 
-#include "dsmoe/neighbors.h"
+#include "dsmoe/training/neighbors.h"
 #include "refusal.h"
 
 namespace dsmoe {

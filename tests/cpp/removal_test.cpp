@@ -113,7 +113,7 @@ TYPED_TEST(RemovalIn, EqualsTheSumsOverTheOthers) {
       Pixel pixel = layers(opacity);
       if (Blend<kMode>::kLearnsGate) pixel.lambda = gate;
       if (Blend<kMode>::kTails) pixel.tails = 0.01;
-      // Some dozens of roundings; where the sums are small, of transmittances near 1 in place of them.
+      // Some dozens of roundings; if the sums are small, of transmittances near 1 in place of them.
       expect_omissions<kMode, double>(pixel, 1e-15 * 20 / opacity);
       expect_omissions<kMode, float>(pixel, 6e-8 * 20 / opacity);
     }
@@ -143,7 +143,7 @@ TYPED_TEST(RemovalIn, ShowsTheVeilInFrontOfAWall) {
   }
 }
 
-// In float, where digits of faint owners are lost, a cost is still one of colours between 0 and 1. The rounding of 8
+// In float, if digits of faint owners are lost, a cost is still one of colours between 0 and 1. The rounding of 8
 // operations is divided by the owners that are known, which are 1e-6 of the sum or more: that may add 0.5.
 TYPED_TEST(RemovalIn, StaysInTheRangeOfTheColorsInFloat) {
   constexpr BlendMode kMode = TypeParam::value;

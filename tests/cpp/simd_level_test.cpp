@@ -11,7 +11,7 @@
 
 #include "all_modes.h"
 #include "brute_force.h"
-#include "cpu/tile_loop.h"
+#include "cpu/loops.h"
 #include "simd_levels.h"
 #include "test_scene.h"
 

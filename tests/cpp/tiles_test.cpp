@@ -140,7 +140,7 @@ TEST(ForEachTileRow, VisitsOnlyTilesThatTheEllipseMeets) {
     const auto visited = visited_tiles<double>(e, {0, 0, grid.columns, grid.rows}, grid);
     for (int y = 0; y < grid.rows; ++y) {
       for (int x = 0; x < grid.columns; ++x) {
-        // Between the centres of a whole tile's border pixels, also where the image ends earlier.
+        // Between the centres of a whole tile's border pixels, also if the image ends earlier.
         const double least = least_form(e, 16 * x, 16 * x + 15, 16 * y, 16 * y + 15);
         met += least <= e.reach;
         if (!visited[y * grid.columns + x]) continue;

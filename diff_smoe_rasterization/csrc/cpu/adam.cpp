@@ -1,16 +1,18 @@
 // Adam on the CPU: threads take runs of rows.
+#include "dsmoe/training/adam.h"
+
 #include <algorithm>
 
 #include "../refuse_training.h"
-#include "dsmoe/adam_tensors.h"
-#include "multiversion.h"
+#include "dsmoe/training/gaussians.h"
 #include "parallel.h"
 
 namespace dsmoe {
 namespace cpu {
 namespace {
 
-constexpr int64_t kChunk = 1 << 16;  // numbers a thread takes at a time
+// What a thread takes at a time: numbers of a tensor, rows that wait, Gaussians with activations.
+constexpr int64_t kNumbers = 1 << 16, kRows = 1024, kGaussians = 1 << 14;
 
 template <class S>
 DSMOE_MULTIVERSION void step_range(const AdamConstants<S> constants, const AdamRates<S> rates,
@@ -44,7 +46,7 @@ template <class S> void adam(const std::vector<AdamTensor<S>>& tensors, const Ad
   refuse_adam("cpu::adam", tensors);
   for (const AdamTensor<S>& tensor : tensors) {
     if (tensor.size == 0) continue;
-    const int64_t chunk_rows = std::max<int64_t>(1, kChunk / tensor.row_size);
+    const int64_t chunk_rows = std::max<int64_t>(1, kNumbers / tensor.row_size);
     parallel_for(num_threads, tensor.size / tensor.row_size, chunk_rows, [&](int64_t begin, int64_t end) {
       if (step.visible == nullptr) {
         step_rows(tensor, step.constants, begin, end);
@@ -57,6 +59,111 @@ template <class S> void adam(const std::vector<AdamTensor<S>>& tensors, const Ad
 
 template void adam(const std::vector<AdamTensor<float>>&, const AdamStep<float>&, int);
 template void adam(const std::vector<AdamTensor<double>>&, const AdamStep<double>&, int);
+
+// Lazy Adam.
+
+namespace {
+
+template <class S> void catch_up_row(const LazyAdam<S>& adam, int32_t steps, int64_t row) {
+  const LazyAdamMark mark(adam.marks[row]);
+  for (int t = 0; t < adam.num_tensors; ++t) {
+    const LazyAdamTensor<S>& tensor = adam.tensors[t];
+    const int64_t first = row * tensor.row_size;
+    for (int64_t i = first; i < first + tensor.row_size; ++i) {
+      int32_t step = mark.steps;
+      const auto rates = [&] { return adam.rates[step * adam.num_tensors + t]; };
+      if (mark.waiting) {
+        adam_step(adam.constants, rates(), tensor.gradient[i], tensor.parameter[i], tensor.moment[i], tensor.square[i]);
+        ++step;
+      }
+      for (; step < steps; ++step) {
+        adam_rest_step(adam.constants, rates(), tensor.parameter[i], tensor.moment[i], tensor.square[i]);
+      }
+    }
+  }
+  adam.marks[row] = steps;
+}
+
+}  // namespace
+
+template <class S> void catch_up(const LazyAdam<S>& adam, int num_threads) {
+  refuse_catch_up("cpu::catch_up", adam);
+  const int32_t steps = adam.num_steps();
+  parallel_for(num_threads, adam.num_rows, kRows, [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      const bool wanted = adam.radii == nullptr || adam.radii[row] > 0;
+      if (wanted && adam.marks[row] != steps) catch_up_row(adam, steps, row);
+    }
+  });
+}
+
+template <class S> void note_step(const LazyAdamStep<S>& step) {
+  refuse_note_step("cpu::note_step", step);
+  const int32_t steps = step.num_steps();
+  for (int t = 0; t < step.num_tensors; ++t) step.rates[int64_t(steps) * step.num_tensors + t] = step.new_rate(t);
+  for (int64_t row = 0; row < step.num_rows; ++row) {
+    if (step.radii[row] > 0) step.marks[row] = ~steps;
+  }
+}
+
+#define DSMOE_INSTANTIATE(S)                       \
+  template void catch_up(const LazyAdam<S>&, int); \
+  template void note_step(const LazyAdamStep<S>&);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+// Adam with activations.
+
+namespace {
+
+template <class S>
+void step_number_at(const GaussianAdam<S>& adam, const ActivatedTensor<S>& tensor, const AdamRates<S>& rates, bool seen,
+                    int64_t i) {
+  ActivatedNumbers<S, 1> n = {};
+  const bool activated = tensor.activation != Activation::kNone;
+  n.raw[0] = tensor.raw[i], n.moment[0] = tensor.moment[i], n.square[0] = tensor.square[i];
+  if (activated) n.value[0] = tensor.value[i];
+  if (seen) n.dL_dvalue[0] = tensor.dL_dvalue[i];
+  step_number(adam.constants, tensor.activation, rates, n);
+  tensor.raw[i] = n.raw[0], tensor.moment[i] = n.moment[0], tensor.square[i] = n.square[0];
+  if (activated) tensor.value[i] = n.value[0];
+}
+
+template <class S>
+void step_quaternion_at(const GaussianAdam<S>& adam, const ActivatedTensor<S>& tensor, const AdamRates<S>& rates,
+                        bool seen, int64_t i) {
+  ActivatedNumbers<S, 4> n = {};
+  std::copy_n(tensor.raw + i, 4, n.raw);
+  std::copy_n(tensor.moment + i, 4, n.moment);
+  std::copy_n(tensor.square + i, 4, n.square);
+  if (seen) std::copy_n(tensor.dL_dvalue + i, 4, n.dL_dvalue);
+  step_quaternion(adam.constants, rates, seen, n);
+  std::copy_n(n.raw, 4, tensor.raw + i);
+  std::copy_n(n.moment, 4, tensor.moment + i);
+  std::copy_n(n.square, 4, tensor.square + i);
+  std::copy_n(n.value, 4, tensor.value + i);
+}
+
+}  // namespace
+
+template <class S> void step_gaussians(const GaussianAdam<S>& adam, int num_threads) {
+  refuse_step_gaussians("cpu::step_gaussians", adam);
+  parallel_for(num_threads, adam.num_gaussians, kGaussians, [&](int64_t begin, int64_t end) {
+    for (int t = 0; t < kGaussianAdamTensors; ++t) {
+      const ActivatedTensor<S>& tensor = adam.tensors[t];
+      const AdamRates<S> rates = adam.rates(t);
+      const int group = tensor.group(), size = tensor.row_size;
+      for (int64_t i = begin * size; i < end * size; i += group) {
+        const bool seen = adam.radii[i / size] > 0;
+        group == 4 ? step_quaternion_at(adam, tensor, rates, seen, i) : step_number_at(adam, tensor, rates, seen, i);
+      }
+    }
+  });
+}
+
+template void step_gaussians(const GaussianAdam<float>&, int);
+template void step_gaussians(const GaussianAdam<double>&, int);
 
 }  // namespace cpu
 }  // namespace dsmoe

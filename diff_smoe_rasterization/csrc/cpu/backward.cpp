@@ -5,13 +5,11 @@
 #include <vector>
 
 #include "../refuse.h"
-#include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
+#include "loops.h"
 #include "parallel.h"
-#include "stopwatch.h"
 #include "tile_kernels.h"
-#include "tile_loop.h"
 
 namespace dsmoe {
 namespace cpu {
@@ -26,11 +24,11 @@ template <class S> void add_records(const S* records, int64_t count, int size, d
   }
 }
 
-// What the tiles say of each Gaussian. Where means2D_abs is wanted, records end with its sums.
+// What the tiles say of each Gaussian. If means2D_abs is wanted, records end with its sums.
 template <class S> struct Records {
   int size;                           // numbers a record
   std::unique_ptr<S[]> of_instances;  // one for each instance, a Gaussian's side by side
-  std::vector<double> of_gaussians;   // their sums, where the tile lists were made band by band; else empty
+  std::vector<double> of_gaussians;   // their sums, if the tile lists were made band by band; else empty
 };
 
 // Also writes the gradient by the background.
@@ -80,8 +78,8 @@ template <class S> class RecordSums {
   RecordSums(const Frame<S>& frame, const Records<S>& records, S* means2D_abs)
       : frame_(frame), records_(records), means2D_abs_(means2D_abs), sum_(records.size), wide_(records.size) {}
 
-  // Fills `sums`, which last until the next call, with those of Gaussian i, and stores its absolute ones where they are
-  // wanted. Returns false where it has no instances.
+  // Fills `sums`, which last until the next call, with those of Gaussian i, and stores its absolute ones if they are
+  // wanted. Returns false if it has no instances.
   bool operator()(int64_t i, PixelSums<S>& sums) {
     const SavedForward<S>& saved = frame_.saved;
     const int size = records_.size;
@@ -109,7 +107,7 @@ template <class S> class RecordSums {
  private:
   const Frame<S>& frame_;
   const Records<S>& records_;
-  S* means2D_abs_;  // null where it is not wanted
+  S* means2D_abs_;  // null if it is not wanted
   std::vector<S> sum_;
   std::vector<double> wide_;
 };

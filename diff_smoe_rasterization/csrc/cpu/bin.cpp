@@ -7,20 +7,19 @@
 #include <vector>
 
 #include "../dispatch.h"
-#include "bands.h"
 #include "dsmoe/blend.h"
 #include "dsmoe/depth_bits.h"
 #include "dsmoe/project.h"
 #include "dsmoe/rasterize.h"
+#include "loops.h"
 #include "parallel.h"
 #include "radix_sort.h"
-#include "stopwatch.h"
 
 namespace dsmoe {
 namespace cpu {
 namespace {
 
-// The Gaussians that have instances, nearest first where the mode needs it, else in the order of their indices.
+// The Gaussians that have instances, nearest first if the mode needs it, else in the order of their indices.
 template <class S>
 std::vector<KeyedIndex<DepthBits<S>>> depth_order(int64_t num_gaussians, const RasterConfig<S>& config,
                                                   const SavedForward<S>& saved) {

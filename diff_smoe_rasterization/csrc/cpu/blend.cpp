@@ -1,9 +1,7 @@
 // Stage 3: the images.
-#include "bands.h"
 #include "dsmoe/rasterize.h"
-#include "stopwatch.h"
+#include "loops.h"
 #include "tile_kernels.h"
-#include "tile_loop.h"
 
 namespace dsmoe {
 namespace cpu {

@@ -1,5 +1,5 @@
 // Rows by a list on the CPU: threads take runs of them.
-#include "dsmoe/gather.h"
+#include "dsmoe/training/gather.h"
 
 #include <algorithm>
 

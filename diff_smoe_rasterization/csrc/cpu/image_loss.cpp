@@ -1,12 +1,11 @@
 // L1, squares and SSIM on the CPU. Threads take bands of rows of one plane. Windows run along each row, then down the
 // last eleven rows, which are kept in a ring.
-#include "dsmoe/image_loss.h"
+#include "dsmoe/training/image_loss.h"
 
 #include <algorithm>
 #include <vector>
 
 #include "../refuse_training.h"
-#include "multiversion.h"
 #include "parallel.h"
 
 namespace dsmoe {
@@ -172,7 +171,7 @@ void blur_band(RowBlur<S>& blur, int begin, int end, int height, Push push, Take
   }
 }
 
-// Returns the target's row. Where the target is bytes, `buffer` holds the row.
+// Returns the target's row. If the target is bytes, `buffer` holds the row.
 template <class S> const S* target_row(const ImageLoss<S>& loss, int64_t index, S* buffer) {
   if (loss.target != nullptr) return loss.target + index;
   from_bytes(loss.target_bytes + index, buffer, loss.width);

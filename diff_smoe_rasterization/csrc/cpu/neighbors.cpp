@@ -1,5 +1,5 @@
 // The three nearest neighbours of every point: exact, by a k-d tree whose nodes are ranges of one list.
-#include "dsmoe/neighbors.h"
+#include "dsmoe/training/neighbors.h"
 
 #include <algorithm>
 #include <array>

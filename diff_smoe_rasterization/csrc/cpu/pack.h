@@ -2,7 +2,7 @@
 //
 // Included once per instruction set, by a file that has set DSMOE_SIMD (the namespace, so that each set's code has
 // its own symbols) and DSMOE_SIMD_BYTES (the register's size: 64 is AVX-512, 32 is AVX2 with FMA, 16 any machine). It
-// uses the compilers' vector types. Where those make poor masks or no FMA, it uses intrinsics. The compilers' own
+// uses the compilers' vector types. If those make poor masks or no FMA, it uses intrinsics. The compilers' own
 // macros (__AVX2__ ...) cannot choose: GCC expands them before it sees the target pragma.
 #pragma once
 
@@ -83,7 +83,7 @@ template <class T> struct Pack {
 
   Pack() = default;
   DSMOE_HD Pack(Values values) : v(values) {}
-  DSMOE_HD Pack(T value) : v(value - Values{}) {}  // value - 0 is value, also where that is -0: no subtraction is left
+  DSMOE_HD Pack(T value) : v(value - Values{}) {}  // value - 0 is value, also if that is -0: no subtraction is left
 
   static DSMOE_HD Pack load(const T* p) { return *reinterpret_cast<const Values*>(p); }  // aligned
   DSMOE_HD void store(T* p) const { *reinterpret_cast<Values*>(p) = v; }                 // aligned

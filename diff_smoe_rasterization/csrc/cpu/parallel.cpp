@@ -39,7 +39,7 @@ class Pool {
   }
 
  private:
-  // Where no more threads can be had, the calling thread does their share.
+  // If no more threads can be had, the calling thread does their share.
   void grow(int num_threads) {
     try {
       for (; num_threads_ < num_threads; ++num_threads_) std::thread([this] { serve(); }).detach();

@@ -1,10 +1,18 @@
-// Threads of the CPU backend: one pool for the process, shared by all calls.
+// Threads of the CPU backend: one pool for the process, shared by all calls. Functions for several instruction sets.
 #pragma once
 
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
 #include <functional>
+
+// Compiles a function once per instruction set. The loader takes the best one that the processor has. The results are
+// the same bits in each, because no compiler flag lets products and sums become fused.
+#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
+#define DSMOE_MULTIVERSION __attribute__((target_clones("avx2", "default")))
+#else
+#define DSMOE_MULTIVERSION
+#endif
 
 namespace dsmoe {
 namespace cpu {

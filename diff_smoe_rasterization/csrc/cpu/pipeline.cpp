@@ -1,4 +1,6 @@
 // The order of the stages, and the memory between them.
+#include <new>
+
 #include "../refuse.h"
 #include "dsmoe/rasterize.h"
 
@@ -6,7 +8,9 @@ namespace dsmoe {
 namespace cpu {
 namespace {
 
-// From the footprints to the images. Lists are kept where they fit.
+constexpr std::align_val_t kAlignment{256};  // as Scratch promises
+
+// From the footprints to the images. Lists are kept if they fit.
 template <class S>
 void draw(Frame<S>& frame, SavedSizes sizes, int64_t num_instances, Allocator& memory, StageTimes* times) {
   const bool fit = num_instances <= frame.config.most_instances;
@@ -63,6 +67,20 @@ template <class S> void radii(const Frame<S>& frame, Scratch& scratch) {
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE
+
+Heap::~Heap() {
+  for (void* block : blocks_) ::operator delete(block, kAlignment);
+}
+
+void* Heap::allocate(size_t bytes) {
+  blocks_.reserve(blocks_.size() + 1);  // so that no block is lost
+  blocks_.push_back(::operator new(bytes, kAlignment));
+  return blocks_.back();
+}
+
+void* Heap::keep(int, const SavedArray& array) { return allocate(array.bytes()); }
+
+void Heap::release() {}
 
 }  // namespace cpu
 }  // namespace dsmoe

@@ -2,11 +2,10 @@
 #include <algorithm>
 
 #include "../refuse.h"
-#include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
+#include "loops.h"
 #include "parallel.h"
-#include "stopwatch.h"
 
 namespace dsmoe {
 namespace cpu {

@@ -62,7 +62,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   }
 
   DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(record(slot), 1); }
-  // Of one Gaussian. Its features' gradients lie here where their number is known, else in scratch memory.
+  // Of one Gaussian. Its features' gradients lie here if their number is known, else in scratch memory.
   struct Sums {
     GateMoments<P> moments;
     Vec2<P> absolute;  // of absolute gradients by the mean
@@ -145,7 +145,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   }
 
   const int num_features_;
-  const bool absolute_;  // false, when compiling, where the number of features is known
+  const bool absolute_;  // false, when compiling, if the number of features is known
   const PixelArray<S> transmittance_, suffix_, base_, last_;
   // g', one array a feature, a cell further on: a load may wait for a store just before it that lies 4 KB away.
   const PixelArray<S> scaled_;

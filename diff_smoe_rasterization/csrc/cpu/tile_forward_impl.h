@@ -36,12 +36,12 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
     if (Blend<kMode>::kNearFirst) std::fill_n(tails_.values, 2 * kTilePixels, S(0));
   }
 
-  // Blends all pixels, by their near pairs where the rendering blends them first, and then the wide ones with all their
+  // Blends all pixels, by their near pairs if the rendering blends them first, and then the wide ones with all their
   // pairs. Returns how many pairs had their exponent evaluated.
   DSMOE_HD int64_t paint() {
     const bool near_first = tile_.config.blend.blends_near_first();
     int64_t pairs = 0;
-    // Where near pairs are not blended first, all pixels of a mode with tails are wide.
+    // If near pairs are not blended first, all pixels of a mode with tails are wide.
     if (!Blend<kMode>::kTails || near_first) pairs += paint<Pairs::kNarrow>();
     if constexpr (Blend<kMode>::kNearFirst) {
       constexpr Pairs kPairs = Blend<kMode>::kTails ? Pairs::kWithTails : Pairs::kWide;
@@ -197,12 +197,12 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   const S tail_alpha_;  // of BlendRules
   const PixelArray<S> transmittance_, gate_sum_, last_;
   const PixelArray<S> sums_;   // one array a feature
-  const PixelArray<S> tails_;  // behind them, where the mode has tails
-  const PixelArray<S> wide_;   // 1 in wide pixels, else 0: where the mode has any
+  const PixelArray<S> tails_;  // behind them, if the mode has tails
+  const PixelArray<S> wide_;   // 1 in wide pixels, else 0: if the mode has any
   CellBits open_;              // cells that take further pairs
   ListedGaussian<S> batch_[kBatch];
   alignas(64) CellBits met_[kBatch], smooth_[kBatch];  // of the batch
-  alignas(64) S alphas_[kBatch][P::kLanes];            // of a pack of pixels; where the pair does not count 0, or
+  alignas(64) S alphas_[kBatch][P::kLanes];            // of a pack of pixels; if the pair does not count 0, or
                                                        // less by what it is as a tail
 };
 

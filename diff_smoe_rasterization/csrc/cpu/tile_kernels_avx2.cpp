@@ -1,4 +1,4 @@
-// The tile kernels for AVX2: 32-byte packs. Empty where the target is not x86-64.
+// The tile kernels for AVX2: 32-byte packs. Empty if the target is not x86-64.
 #if defined(__x86_64__)
 
 // Everything below is compiled for this instruction set, so nothing here may define code that other files share:

@@ -3,7 +3,6 @@
 
 #include "tile_backward_impl.h"
 #include "tile_forward_impl.h"
-#include "tile_importance_impl.h"
 #include "tile_pass_impl.h"
 
 namespace dsmoe {

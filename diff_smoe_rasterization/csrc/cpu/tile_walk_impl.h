@@ -119,7 +119,7 @@ template <class S> struct ListedGaussian {
 
 // Which pairs a walk is for.
 enum class Pairs {
-  kNarrow,    // those that count in every pixel: the near ones where the rendering blends them first
+  kNarrow,    // those that count in every pixel: the near ones if the rendering blends them first
   kWide,      // all that count in wide pixels
   kWithTails  // and their tails
 };
@@ -158,14 +158,14 @@ template <class S> class GaussianList {
   }
 
  private:
-  // Smooth cells lie inside the footprint, of the near pairs where they come first: each of their pairs counts. The
+  // Smooth cells lie inside the footprint, of the near pairs if they come first: each of their pairs counts. The
   // exponent changes by at most `spread` between a cell's centre and its pixels.
   DSMOE_HD void find_cells(const ProjectedGaussian<S>& gaussian, ListedGaussian<S>& listed) const {
     using P = Pack<S>;
     const Sym2<S>& conic = gaussian.conic;
     const ExponentFactors<S>& factors = listed.exponent;
     const S bend = kReach * kReach * (abs(factors.xy) - factors.xx - factors.yy);
-    // Where the determinant is all but lost, the exponent may be above 0. The clamp of alpha, at 0.99, is left out.
+    // If the determinant is all but lost, the exponent may be above 0. The clamp of alpha, at 0.99, is left out.
     const bool may_be_smooth = bend < S(0.25) * kLargestSpread && gaussian.opacity < S(0.98) &&
                                conic.xy * conic.xy < S(0.9999) * conic.xx * conic.yy;
     const S full_reach = near_first_ ? near_reach(gaussian.opacity, gaussian.squared_reach) : gaussian.squared_reach;
@@ -289,7 +289,7 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
 //   wanted(at, pixels)    whether a pack's pairs are wanted, and for which pixels; at: the first in a PixelArray
 //   take(at, pairs, pixels, sums)   a pack of pairs
 //   end(gaussian, sums)
-// Between `begin` and `end`, `wanted` is asked of each pack that the footprint may meet. Where it says so, `take`
+// Between `begin` and `end`, `wanted` is asked of each pack that the footprint may meet. If it says so, `take`
 // follows.
 template <class S, class Visitor>
 DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features,

@@ -2,7 +2,7 @@
 #include <algorithm>
 
 #include "../refuse_training.h"
-#include "dsmoe/adam_tensors.h"
+#include "dsmoe/training/adam.h"
 #include "tuning.cuh"
 
 namespace dsmoe {

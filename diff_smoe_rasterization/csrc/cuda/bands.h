@@ -81,7 +81,7 @@ std::vector<TileBand> cut_into_bands(const Frame<S>& frame, ReusedScratch& scrat
   return bands;
 }
 
-// Calls visit(frame) where the frame has lists. Else it makes the lists of one band after the other, and calls visit
+// Calls visit(frame) if the frame has lists. Else it makes the lists of one band after the other, and calls visit
 // with a frame for each, from top to bottom.
 template <class S, class Visit> void for_each_band(const Frame<S>& frame, const Work& work, Visit visit) {
   if (frame.saved.capacity > 0) return visit(frame);

@@ -8,7 +8,7 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// What a lane's pixels have blended so far. A lane has kLanePixels of a square, or one where two warps share the
+// What a lane's pixels have blended so far. A lane has kLanePixels of a square, or one if two warps share the
 // square.
 template <class S, int kSums, int kPixels> struct BlendedPixels {
   int first;  // of these pixels, in a lane that has all of them
@@ -18,7 +18,7 @@ template <class S, int kSums, int kPixels> struct BlendedPixels {
   bool wide[kPixels];      // the pixel is: known behind the narrow walk
 };
 
-// Notes the state of the pixels where a segment begins; in a wide walk that of the wide pixels, where `kept`.
+// Notes the state of the pixels where a segment begins; in a wide walk that of the wide pixels, if `kept`.
 template <class S, int kSums, int kPixels>
 __device__ void note_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
                              const BlendedPixels<S, kSums, kPixels>& pixels, bool kept) {
@@ -97,7 +97,7 @@ template <class S, BlendMode kMode, int kSums, int kPixels, bool kWide> struct B
   const BlendArguments<S>& arguments;
   const WarpTile<S>& tile;
   BlendedPixels<S, kSums, kPixels>& pixels;
-  int32_t next_segment;  // where the next segment begins; beyond the list where it is not noted in segments
+  int32_t next_segment;  // where the next segment begins; beyond the list if it is not noted in segments
   int* begun;            // the last segment that a warp of a shared square has begun
   int narrow_last = 0;   // the last segment that the warp's narrow walk has begun
   S tails[kPixels] = {};
@@ -121,7 +121,7 @@ __device__ bool open_wide(const BlendArguments<S>& arguments, const WarpTile<S>&
   return __any_sync(kAllLanes, any);
 }
 
-// Blends kSums features from `first_feature` on, and writes them. Where two warps share a square, first_pixel says
+// Blends kSums features from `first_feature` on, and writes them. If two warps share a square, first_pixel says
 // which half is the warp's, begun is 0 in shared memory, and all warps of the block call this that have pixels in the
 // image.
 template <BlendMode kMode, int kSums, int kPixels = kLanePixels, class S>
@@ -144,7 +144,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   const WalkRange range = {0, tile.source.length, first_feature};
   Visitor visitor = {arguments, tile, blended, segments ? kSegmentLength : INT32_MAX, begun};
   unsigned met = 0;
-  // Where near pairs are not blended first, all pixels of a mode with tails are wide.
+  // If near pairs are not blended first, all pixels of a mode with tails are wide.
   if (!Blend<kMode>::kTails || arguments.near_first) met = walk_tile(stage, range, visitor);
   int last = segments ? visitor.next_segment / kSegmentLength - 1 : 0;
   [[maybe_unused]] S tails[kPixels] = {};
@@ -161,7 +161,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     }
   }
   if (Visitor::kInSegments && segments) {
-    // Where pixels do not stop, the backward pass walks the whole list.
+    // If pixels do not stop, the backward pass walks the whole list.
     if (!Visitor::kStopsEarly) {
       visitor.begin_segments(tile.source.length - 1);
       last = visitor.next_segment / kSegmentLength - 1;
@@ -198,7 +198,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   if (first_feature == 0) count_pairs(arguments, tile.lane, met, kPixels * kWarp);
 }
 
-// The first blocks come in pairs, for the tiles with the longest lists. Where such a list is long, each of the two has
+// The first blocks come in pairs, for the tiles with the longest lists. If such a list is long, each of the two has
 // half of the tile, and two warps share a square of pixels. Else the first of them has the tile, as all other blocks
 // do. Which lists are shared may change from run to run, with the order of tiles of one class. So both ways must come
 // to the same bits: products are added by fma or behind a select, and the compiler has no choice.

@@ -1,4 +1,4 @@
-// From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures. Where
+// From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures. If
 // sums of absolute gradients by the mean are wanted, they follow in the record, and are split off at the end.
 #include "../dispatch.h"
 #include "bands.h"
@@ -16,7 +16,7 @@ namespace {
 template <class S> struct BackwardArguments : BlendArguments<S> {
   ImageGradients<S> dL_dimages;  // [features, H, W], and of the gate sum [H, W]; any may be null
   S* dL_dbackground_rows;        // [tiles * kWarpsPerTile, C + 1] of each warp of the band, or null
-  S* scaled;                     // [F, H, W] g', where the number of features is not known
+  S* scaled;                     // [F, H, W] g', if the number of features is not known
   int num_features;              // F
   int tiles;                     // of the band
   bool absolute;                 // records end with the sums of absolute gradients
@@ -26,7 +26,7 @@ template <class S, class Sink> struct BackwardWithSink : BackwardArguments<S> {
   Sink sink;  // where each warp's sums go
 };
 
-// g' of one lane's pixels: in registers where the number of features is known, else in memory.
+// g' of one lane's pixels: in registers if the number of features is known, else in memory.
 template <class S, int kFeatures> struct ScaledGradients {
   S values[kLanePixels][kFeatures];
   __device__ S get(const BackwardArguments<S>&, const WarpTile<S>&, int k, int f) const { return values[k][f]; }
@@ -44,7 +44,7 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Sums a batch by tensor cores, and gives the sums of its `count` Gaussians to the sink. Where the batch is not full,
+// Sums a batch by tensor cores, and gives the sums of its `count` Gaussians to the sink. If the batch is not full,
 // the other rows hold old values, and their sums are not used. kRecord: numbers of a record.
 template <int kRecord, class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
@@ -107,7 +107,7 @@ struct TensorShare {
 };
 
 // Walks back to front, and sums for each Gaussian the moments of dL/dpower and the gradients of its features.
-// kAbsolute: also sums |dL/dmean|. Where the number of features is not known, the arguments say that instead.
+// kAbsolute: also sums |dL/dmean|. If the number of features is not known, the arguments say that instead.
 template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink, Pairs kWanted> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kInSegments = false;
@@ -115,7 +115,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink, P
   static constexpr Pairs kPairs = kWanted;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
   static constexpr int kUnroll = kTensor ? kBackwardUnroll : 1;
-  [[maybe_unused]] static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
+  [[maybe_unused]] static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // if kTensor
 
   __device__ __forceinline__ bool is_absolute() const {
     return kFeatures != kAnyFeatures ? kAbsolute : arguments.absolute;
@@ -227,7 +227,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink, P
   TensorRow* row;  // of the tensor stage, for the next Gaussian
 };
 
-// Sets what a warp's pixels start with, before any pair. Where the background's gradients are wanted, it also writes
+// Sets what a warp's pixels start with, before any pair. If the background's gradients are wanted, it also writes
 // the warp's row of them; the warp of the list's first segment does that.
 template <BlendMode kMode, class S, int kFeatures>
 __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
@@ -285,7 +285,7 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
 }
 
 // Returns the part of the list that a warp walks: up to the last pair that some pixel has taken, and in a list with
-// segments only its own one. The part may be empty. Where another segment lies behind, the pixels get its state.
+// segments only its own one. The part may be empty. If another segment lies behind, the pixels get its state.
 template <BlendMode kMode, class S, int kFeatures>
 __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
                                                       int segment, BackwardPixels<S, kFeatures>& pixels) {
@@ -339,7 +339,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   if (tile.empty) return;
   const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
   if (range.begin >= range.end) return;
-  // Where u is g'.c - b, the sum g'.c begins with -b, and b is 0 from here on. That saves a subtraction a pair.
+  // If u is g'.c - b, the sum g'.c begins with -b, and b is 0 from here on. That saves a subtraction a pair.
   for (int k = 0; k < kLanePixels; ++k) {
     pixels.value_begin[k] = Blend<kMode>::kSuffixAboutBase ? -pixels.state[k].base : S(0);
     if (Blend<kMode>::kSuffixAboutBase) pixels.state[k].base = S(0);

@@ -25,15 +25,15 @@ class InstanceCapacities {
 
   static constexpr size_t kMostKeys = 1024;  // that are remembered; each pins a few bytes for ever
 
-  // What is likely to be enough for so many Gaussians, or -1 where nothing is known of the key. captured: into a graph,
+  // What is likely to be enough for so many Gaussians, or -1 if nothing is known of the key. captured: into a graph,
   // which keeps its room; it gets 1.5 times the greatest count.
   int64_t likely(const Key& key, int64_t num_gaussians, bool captured = false);
 
-  // Learns the count of a rendering that has just been launched, as soon as the device has it. Where the table is full,
+  // Learns the count of a rendering that has just been launched, as soon as the device has it. If the table is full,
   // the key that was longest not used is forgotten.
   void learn(const Key& key, int64_t num_gaussians, const int64_t* num_instances, cudaStream_t stream);
 
-  // The greatest count lately, for so many Gaussians; -1 where nothing is known of the key.
+  // The greatest count lately, for so many Gaussians; -1 if nothing is known of the key.
   int64_t greatest(const Key& key, int64_t num_gaussians);
 
   static InstanceCapacities& shared();
@@ -52,7 +52,7 @@ class InstanceCapacities {
   // Takes over what the device has counted.
   static int64_t greatest_of(Count& count, int64_t num_gaussians);
 
-  // The counts of the key or, where it has none, of half or twice as many Gaussians.
+  // The counts of the key or, if it has none, of half or twice as many Gaussians.
   std::map<Key, Count>::iterator find_nearest(Key key);
 
   int64_t* pinned_count();  // memory that no key has

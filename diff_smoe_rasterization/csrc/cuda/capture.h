@@ -14,7 +14,7 @@ inline bool is_capturing(cudaStream_t stream) {
   return status != cudaStreamCaptureStatusNone;
 }
 
-// A capture on another thread forbids all threads what might disturb it: to allocate memory, to wait. Where that cannot
+// A capture on another thread forbids all threads what might disturb it: to allocate memory, to wait. If that cannot
 // touch the capture, this lets the calling thread do it. Without, the capture would be invalid.
 class BesideCaptures {
  public:

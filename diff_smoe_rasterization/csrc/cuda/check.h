@@ -6,7 +6,7 @@
 namespace dsmoe {
 namespace cuda {
 
-// Throws where `status` is an error; `what` names what was tried.
+// Throws if `status` is an error; `what` names what was tried.
 void check(cudaError_t status, const char* what);
 
 }  // namespace cuda

@@ -1,5 +1,5 @@
 // Sums of a few numbers for each Gaussian, in any order of their terms by atomics, or exactly: then they are the same
-// bits in any order, where nothing bounds a term beforehand. For these a walk over the pixels finds the largest term of
+// bits in any order, if nothing bounds a term beforehand. For these a walk over the pixels finds the largest term of
 // each sum, and a second walk adds the terms as integers. Their unit is a power of two, so far below the largest term
 // that the sum of as many terms as there may be just fits 64 bits: a term of 2^-40 of the largest one still counts in
 // an image of some megapixels.
@@ -41,7 +41,7 @@ template <class S> struct ExactSums {
     }
   }
 
-  // A sum as a number; NaN where a term was not finite.
+  // A sum as a number; NaN if a term was not finite.
   __device__ S sum(int number, int64_t gaussian) const {
     const int64_t at = number * num_gaussians + gaussian;
     if (exponents[at] == kNotFinite) return S(NAN);
@@ -84,7 +84,7 @@ void sum_exactly(const Frame<S>& frame, const SumTargets<S>& to, const Work& wor
   DSMOE_CHECK_LAUNCH("store_exact_sums");
 }
 
-// Calls walk(sums) with AtomicSums, or as `sum_exactly` does where work.deterministic asks for it.
+// Calls walk(sums) with AtomicSums, or as `sum_exactly` does if work.deterministic asks for it.
 template <class S, class Walk>
 void sum_terms(const Frame<S>& frame, const SumTargets<S>& to, const Work& work, Walk walk) {
   const size_t bytes = frame.inputs.num_gaussians * sizeof(S);

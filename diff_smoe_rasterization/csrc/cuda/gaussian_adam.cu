@@ -1,6 +1,6 @@
 // Adam with activations: a block takes a piece of one tensor, as in adam.cu.
 #include "../refuse_training.h"
-#include "dsmoe/gaussian_adam.h"
+#include "dsmoe/training/gaussians.h"
 #include "tuning.cuh"
 
 namespace dsmoe {

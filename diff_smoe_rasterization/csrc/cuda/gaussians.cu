@@ -1,5 +1,5 @@
 // Passes over all Gaussians, or over what else there are many of: a thread each.
-#include "dsmoe/gaussians.h"
+#include "dsmoe/training/gaussians.h"
 #include "tuning.cuh"
 
 namespace dsmoe {

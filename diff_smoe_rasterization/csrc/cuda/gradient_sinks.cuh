@@ -15,7 +15,7 @@ template <class S> struct RecordSink {
   int length;  // numbers a record
 
   // Calls put(add), where add(k, term) adds to number `first` + k of the record of a Gaussian. numbers: those of a
-  // record, a constant where the caller has one.
+  // record, a constant if the caller has one.
   template <class Put>
   __device__ __forceinline__ void to_record(int32_t gaussian, int numbers, int first, Put put) const {
     S* from_first = records + int64_t(gaussian) * numbers + first;

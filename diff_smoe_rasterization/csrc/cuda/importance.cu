@@ -1,5 +1,5 @@
 // What each Gaussian is worth to an image. The kernel repeats the blend's walk beside the finished pixels. A warp sums
-// over its pixels, a batch of Gaussians at a time, and adds their numbers by atomics, or exactly where the sums must be
+// over its pixels, a batch of Gaussians at a time, and adds their numbers by atomics, or exactly if the sums must be
 // the same bits every time.
 #include <type_traits>
 
@@ -15,14 +15,14 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// Visits that are interleaved where the number of channels is known. And blocks that one multiprocessor then holds at
+// Visits that are interleaved if the number of channels is known. And blocks that one multiprocessor then holds at
 // once: 5 x 128 threads leave each thread 96 registers.
 constexpr int kUnrolledVisits = 2;
 constexpr int kBlocks = 5;
 
 template <class S> struct ImportanceArguments : BlendArguments<S> {
   ImportanceMap<S> map;
-  S* fronts;  // [C, H, W] the sums A, where the number of channels is not known
+  S* fronts;  // [C, H, W] the sums A, if the number of channels is not known
   int tiles;  // of the band
 };
 
@@ -30,7 +30,7 @@ template <class S, class Sums> struct ImportanceWithSums : ImportanceArguments<S
   Sums sums;  // AtomicSums or ExactSums
 };
 
-// C and A of one lane's pixels, a channel at a time: in registers where the number of channels is known, else in
+// C and A of one lane's pixels, a channel at a time: in registers if the number of channels is known, else in
 // memory.
 template <class S, int kChannels> struct ChannelSums {
   S values[kLanePixels][kChannels], fronts[kLanePixels][kChannels];
@@ -168,7 +168,7 @@ template <class S, BlendMode kMode, int kChannels, class Sums, Pairs kWanted> st
 template <class S, BlendMode kMode, int kChannels>
 constexpr bool kWeighsSegments = kWalksSegments<S, kMode, kChannels>&& Blend<kMode>::kStopsEarly;
 
-// Whether T tells enough of what lies in front of a segment. W = 1 - T loses digits where it is small, and so does D,
+// Whether T tells enough of what lies in front of a segment. W = 1 - T loses digits if it is small, and so does D,
 // unless a gate of the background is in it: behind 1,300 opacities of 2e-5 to 5e-5 the norm of the costs is off by
 // 4.4e-4 at the gate 0, by 1.2e-4 at 0.03.
 template <BlendMode kMode, class Config> __device__ bool knows_front(const Config& config) {
@@ -203,8 +203,8 @@ __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& argum
   }
 }
 
-// Moves the pixels to the begin of a segment. A is the sum of w (c - C) in front of it. That is minus the sum behind
-// it, with lambda T (bg - C), because over a whole pixel they sum to 0.
+// Moves the pixels to the beginning of a segment. A is the sum of w (c - C) in front of it. That is minus the sum
+// behind it, with lambda T (bg - C), because over a whole pixel they sum to 0.
 template <class S, BlendMode kMode, int kChannels>
 __device__ __forceinline__ void move_to_segment(const ImportanceArguments<S>& arguments, const WarpTile<S>& tile,
                                                 int segment, WeighedPixels<S, kChannels>& pixels) {

@@ -11,7 +11,7 @@
 //
 // (2 |dL/dA| in a mode with tails, whose alpha image is A = W / D)
 //
-// with the largest gradient and the largest feature of the whole image. Where alpha is clamped, dL/dpower is larger by
+// with the largest gradient and the largest feature of the whole image. If alpha is clamped, dL/dpower is larger by
 // o G / alpha. A moment has up to two factors of distance, which the footprint bounds; a sum has no more terms than the
 // footprint has pixels.
 #pragma once
@@ -41,7 +41,7 @@ struct alignas(16) SumExtent {
   int16_t pull_x, pull_y;  // dpower/dmean
 };
 
-// Sums for each number of each Gaussian's record: the moments of dL/dpower, the gradients of the features and, where
+// Sums for each number of each Gaussian's record: the moments of dL/dpower, the gradients of the features and, if
 // they are wanted, the sums of absolute gradients by the mean.
 template <class S> struct IntegerSums {
   unsigned long long* sums;   // [N, length] signed; zero before
@@ -77,7 +77,7 @@ template <class S> struct IntegerSums {
     if (abs(units) < kNoRest<S>) add_whole(rests + at, rint((units - whole) * power_of_two(kRestBits, S())));
   }
 
-  // A sum as a number; NaN where a term was refused.
+  // A sum as a number; NaN if a term was refused.
   __device__ S sum(int64_t gaussian, int number) const {
     const int64_t at = gaussian * length + number;
     if (refused[at]) return S(NAN);
@@ -98,7 +98,7 @@ template <class S> struct SumBounds {
   int width, height;             // of the image, pixels
   RasterConfig<S> config;        // the background is read
   SavedForward<S> saved;         // projected and features are read
-  const int32_t* radii;          // [N] pixels; 0 where the rest means nothing
+  const int32_t* radii;          // [N] pixels; 0 if the rest means nothing
   ImageGradients<S> dL_dimages;  // any may be null
   int32_t* gradients;            // [F + 1] exponents of the largest dL/dfeature and dL/dgate_sum
   int32_t* features;             // [feature_stride(F)] of the largest features; both are below every exponent before
@@ -198,9 +198,9 @@ __global__ void __launch_bounds__(kStoreBlock)
 
 template <class S> struct IntegerRecords {
   int64_t num_gaussians;  // N
-  const int32_t* radii;   // [N] pixels; 0 where no record is wanted
+  const int32_t* radii;   // [N] pixels; 0 if no record is wanted
   IntegerSums<S> sums;    // read
-  S* records;             // [N, length] written where there is a radius
+  S* records;             // [N, length] written if there is a radius
 };
 
 template <class S>

@@ -3,7 +3,7 @@
 #include <algorithm>
 
 #include "../refuse_training.h"
-#include "dsmoe/lazy_adam.h"
+#include "dsmoe/training/adam.h"
 #include "tuning.cuh"
 
 namespace dsmoe {

@@ -3,7 +3,7 @@
 
 #include "../refuse.h"
 #include "dsmoe/hd.h"
-#include "dsmoe/neighbors.h"
+#include "dsmoe/training/neighbors.h"
 #include "tuning.cuh"
 
 namespace dsmoe {

@@ -1,5 +1,5 @@
 // The kernel of passes over the pixels of a rendering (dsmoe/passes/pass.h). A warp sums over its pixels, then adds the
-// numbers to those of the Gaussian by atomics, or exactly where the sums must be the same bits every time.
+// numbers to those of the Gaussian by atomics, or exactly if the sums must be the same bits every time.
 #pragma once
 
 #include <type_traits>
@@ -22,7 +22,7 @@ template <class S, class Pass> constexpr int kPassBlocks = sizeof(S) == 4 && Pas
 template <class S, class Pass, class To> struct PassArguments : BlendArguments<S> {
   Pass pass;
   To sums;
-  int32_t* counts;  // [N] the number in front of them, where kCounts; null where another walk counts
+  int32_t* counts;  // [N] the number in front of them, if kCounts; null if another walk counts
 
   __device__ void add(int32_t gaussian, int number, S value) const {
     if (number >= Pass::kCounts) {

@@ -38,7 +38,7 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
                                  static_cast<int>(frame.config.blend.mode), frame.inputs.num_gaussians);
 }
 
-// Returns for how many instances there will be room, 1 or more; 0 where there are more than are listed at once.
+// Returns for how many instances there will be room, 1 or more; 0 if there are more than are listed at once.
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
   const int64_t most = frame.config.most_instances;

@@ -29,8 +29,8 @@ template <class S> struct ProjectArguments {
   OrderTargets<S> order;     // written
 };
 
-// Writes the features of a Gaussian, one row of saved.features. Where their number is known they stay in registers
-// until they are written. Returns false where the Gaussian is culled.
+// Writes the features of a Gaussian, one row of saved.features. If their number is known they stay in registers
+// until they are written. Returns false if the Gaussian is culled.
 template <int kFeatures, class S> __device__ bool store_features(const ColorSource<S>& source, S depth, S* out) {
   const RasterConfig<S>& config = source.config;
   if constexpr (kFeatures == kFastFeatures) {
@@ -47,7 +47,7 @@ template <int kFeatures, class S> __device__ bool store_features(const ColorSour
   }
 }
 
-// radius: 0 where Gaussian i is culled.
+// radius: 0 if Gaussian i is culled.
 template <class S> __device__ void store_order(const OrderTargets<S>& to, int64_t i, int32_t radius, S depth) {
   if (to.depths != nullptr) {
     to.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);

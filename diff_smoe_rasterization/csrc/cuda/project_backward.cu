@@ -14,7 +14,7 @@ template <class S> struct ProjectBackwardArguments {
   DeviceCamera<S> camera;          // of the forward pass
   RasterConfig<S> config;          // of the forward pass
   SavedForward<S> saved;           // projected and features are read
-  const int32_t* radii;            // [N] pixels; above 0 where a Gaussian was seen
+  const int32_t* radii;            // [N] pixels; above 0 if a Gaussian was seen
   const S* dL_dgaussians;          // [N, kNumGateMoments + F] the records
   bool by_footprints;              // which are gradients by the footprints, not sums over pixels
   const S* dL_ddepths;             // [N] gradients by the view depths, added to those of the features; or null
@@ -42,7 +42,7 @@ template <class S> __device__ GateGradient<S> gate_of_moments(const ProjectedGau
   return moments_backward(projected.conic, projected.opacity, moments);
 }
 
-// All that comes back to Gaussian i from the image. projected: only read where the record is of sums over pixels.
+// All that comes back to Gaussian i from the image. projected: only read if the record is of sums over pixels.
 template <class S>
 __device__ ProjectedGradient<S> image_gradient(const ProjectBackwardArguments<S>& arguments, int64_t i,
                                                const ProjectedGaussian<S>& projected, const S* record,
@@ -61,7 +61,7 @@ using RecordRows = WarpRows<kRecordLength>;
 // The gradients of a lane's Gaussian, but for those of its SH row.
 struct LaneGradient {
   GaussianGradient<float> gaussian;
-  float dc[3];  // where degree 0 lies apart
+  float dc[3];  // if degree 0 lies apart
 };
 
 // Stores the gradients of a warp's Gaussians, zeros included, as far as these exist. rows: the gradients of the SH
@@ -95,7 +95,7 @@ __device__ void store_gradients(const LaneGradient& gradient, const Rows& rows,
   if (Rows::kDcApart) store_threes(to.dc, load3(gradient.dc), 3);
 }
 
-// The common case. The SH rows come through shared memory. So do the records where they are of colours only. All other
+// The common case. The SH rows come through shared memory. So do the records if they are of colours only. All other
 // numbers live in registers.
 template <bool kCamera, bool kOnlyColors, class Rows>
 __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : kRowsBackwardBlocks)
@@ -225,7 +225,7 @@ template <class S> struct FinishArguments {
   int64_t num_gaussians;  // N
   int length;             // numbers a record
   SavedForward<S> saved;  // projected is read
-  const int32_t* radii;   // [N] pixels; above 0 where a Gaussian was seen
+  const int32_t* radii;   // [N] pixels; above 0 if a Gaussian was seen
   S* records;             // [N, length] read and written
 };
 

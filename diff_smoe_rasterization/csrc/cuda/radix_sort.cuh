@@ -18,7 +18,7 @@ template <class Key> constexpr int kSortTile = kSortBlock* kSortItems<Key>;  // 
 
 template <class Key> struct RadixPass {
   int64_t capacity;        // pairs there is room for
-  const int64_t* count;    // [1] pairs there are; where they do not fit, none is sorted. Null: as many as fit
+  const int64_t* count;    // [1] pairs there are; if they do not fit, none is sorted. Null: as many as fit
   const Key* keys;         // [capacity]
   const int32_t* values;   // [capacity]; null: value i is i, and pairs whose key is the greatest one are left out
   Key* sorted_keys;        // [capacity] written; or null

@@ -21,7 +21,7 @@ class RecentGreatest {
     ++in_window_;
   }
 
-  // -1 where nothing was added.
+  // -1 if nothing was added.
   double greatest() const { return std::max(last_window_, this_window_); }
 
  private:

@@ -12,7 +12,7 @@
 namespace dsmoe {
 namespace cuda {
 
-// `count` numbers, not filled. Throws std::runtime_error where there is no memory left.
+// `count` numbers, not filled. Throws std::runtime_error if there is no memory left.
 template <class T> T* allocate(Scratch& scratch, int64_t count) {
   void* memory = scratch.allocate(static_cast<size_t>(count) * sizeof(T));
   if (memory == nullptr && count > 0) check(cudaErrorMemoryAllocation, "allocating scratch memory");

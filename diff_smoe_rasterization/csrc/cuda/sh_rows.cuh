@@ -1,4 +1,4 @@
-// How the SH coefficients of a warp reach its lanes. Where they are floats they go row by row through shared memory,
+// How the SH coefficients of a warp reach its lanes. If they are floats they go row by row through shared memory,
 // else each lane reads global memory. The two shapes that trainers use most are known when compiling.
 #pragma once
 
@@ -11,8 +11,8 @@ namespace cuda {
 
 constexpr int kAllShLength = 3 * kMaxShCoefficients, kShRestLength = kAllShLength - 3;  // with degree 0, and without
 
-// kStaged: the rows go through shared memory. kLength: numbers a row, or 0 where that is not known when compiling.
-// Where it is known, the colours are of degree 3, and scales and rotations give the shapes.
+// kStaged: the rows go through shared memory. kLength: numbers a row, or 0 if that is not known when compiling.
+// If it is known, the colours are of degree 3, and scales and rotations give the shapes.
 template <bool kStagedRows, int kRowLength> struct ShRows : WarpRows<kRowLength> {
   using WarpRows<kRowLength>::WarpRows;
   static constexpr bool kStaged = kStagedRows, kKnown = kRowLength > 0;
@@ -31,7 +31,7 @@ template <bool kStagedRows, int kRowLength> struct ShRows : WarpRows<kRowLength>
     }
   }
 
-  // The colours of known rows, whose numbers lie in registers; dc: degree 0, where it lies apart.
+  // The colours of known rows, whose numbers lie in registers; dc: degree 0, if it lies apart.
   static __device__ Colors<float> known_colors(const float* dc, const float* sh) {
     return {nullptr, kDcApart ? dc : nullptr, sh, kLength / 3, kMaxShDegree};
   }

@@ -12,7 +12,7 @@
 namespace dsmoe {
 namespace cuda {
 
-// What tile_bounds wants of a Gaussian: its radius, which is only read where the mode needs it. radii: [N].
+// What tile_bounds wants of a Gaussian: its radius, which is only read if the mode needs it. radii: [N].
 template <class S> __device__ S bounding_radius(BlendMode mode, const int32_t* radii, int32_t gaussian) {
   return within_radius(mode) ? S(radii[gaussian]) : S(0);
 }
@@ -33,7 +33,7 @@ class WarpLine {
     total = __shfl_sync(kAllLanes, sum, kWarp - 1);
   }
 
-  // Returns the lane that has item k: the last one that begins at k or before. Where k is beyond the items, the result
+  // Returns the lane that has item k: the last one that begins at k or before. If k is beyond the items, the result
   // is some lane.
   __device__ int owner(unsigned k) const {
     int lane = 0;

@@ -6,7 +6,7 @@
 //
 //   find    the warp looks ahead in the list for entries that may meet its pixels. In most lists entries are marked
 //           with the quarters that they may meet
-//   load    32 of those that it has found, one a lane, while the 32 before them are visited. Where entries are not
+//   load    32 of those that it has found, one a lane, while the 32 before them are visited. If entries are not
 //           marked, each lane tests the footprint of its entry against the warp's pixels
 //   stage   those that meet them go to shared memory
 //   visit   all lanes read the staged entries one after the other, and the visitor does the work of its pass
@@ -57,7 +57,7 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   return arguments;
 }
 
-// Where a tile's walk gets its entries: from the list of the tile, or, where the instances outgrew their memory, from
+// Where a tile's walk gets its entries: from the list of the tile, or, if the instances outgrew their memory, from
 // the depth order of all Gaussians. Both lead front to back.
 template <class S> class EntrySource {
  public:
@@ -165,7 +165,7 @@ template <class S> __device__ __forceinline__ S below(S dy, int k) { return k ==
 // The part of a list that a warp walks.
 struct WalkRange {
   int32_t begin, end;     // entries of the list, half-open
-  int first_feature = 0;  // the kFeatureChunk features from here on come along, where the visitor reads features
+  int first_feature = 0;  // the kFeatureChunk features from here on come along, if the visitor reads features
 };
 
 // Looks ahead in a list.
@@ -233,12 +233,12 @@ template <class S, bool kBackToFront, bool kWide> class EntryFinder {
 
 // Which pairs a walk is for.
 enum class Pairs {
-  kNarrow,    // those that count in every pixel: the near ones where the rendering blends them first
+  kNarrow,    // those that count in every pixel: the near ones if the rendering blends them first
   kWide,      // all that count in wide pixels
   kWithTails  // and their tails
 };
 
-// Calls walk(Constant<kPairs>), with kWide where the mode has wide pixels and some lane has one.
+// Calls walk(Constant<kPairs>), with kWide if the mode has wide pixels and some lane has one.
 template <Pairs kPairs> using PairsConstant = std::integral_constant<Pairs, kPairs>;
 template <BlendMode kMode, class Walk> __device__ __forceinline__ void walk_pairs(bool wide, Walk walk) {
   if constexpr (Blend<kMode>::kNearFirst) {
@@ -314,7 +314,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
 //   visit(staged, number)         one staged entry, for all lanes, and the number of its Gaussian
 //   end_visits(staged, numbers, count)   called after up to kVisitsPerCheck visits, of these staged entries; may be
 //                                 left out
-//   is_done()                     the walk may end; called after end_visits, where the visitor stops early
+//   is_done()                     the walk may end; called after end_visits, if the visitor stops early
 template <class S, class Visitor>
 __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, const WalkRange& range, Visitor& visitor) {
   const int lane = visitor.tile.lane;

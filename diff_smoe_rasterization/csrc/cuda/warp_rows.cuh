@@ -1,5 +1,5 @@
 // Rows of floats, one for each Gaussian of a warp. They lie side by side in global memory. The whole warp copies them
-// to and from shared memory, where each lane has its own row.
+// to and from shared memory, if each lane has its own row.
 #pragma once
 
 #include <cuda_pipeline.h>
@@ -20,7 +20,7 @@ struct SharedAddress {
   }
 };
 
-// Copies a T from global memory to shared memory. Where the device can, the copy is asynchronous.
+// Copies a T from global memory to shared memory. If the device can, the copy is asynchronous.
 template <class T> __device__ void copy_async(SharedAddress to, const float* from) {
   static_assert(sizeof(T) == 4 || sizeof(T) == 16, "the instruction's sizes");
 #if __CUDA_ARCH__ >= 800
@@ -41,9 +41,9 @@ inline __device__ void wait_for_copies() {
   __syncwarp();
 }
 
-// kLength: numbers a row, or 0 where that is only known at run time. Rows of known length are copied four numbers at a
+// kLength: numbers a row, or 0 if that is only known at run time. Rows of known length are copied four numbers at a
 // time, so their array must begin at a multiple of 16 bytes. In shared memory, lanes that read the same place of their
-// rows use different banks: rows are an odd number of words apart or, where they are read as vectors, of vectors.
+// rows use different banks: rows are an odd number of words apart or, if they are read as vectors, of vectors.
 template <int kLength> class WarpRows {
  public:
   static constexpr bool kVectors = kLength % 4 == 0 && kLength > 0;  // a row is made of vectors
@@ -105,7 +105,7 @@ template <int kLength> class WarpRows {
  private:
   // Calls visit(value, global, shared) for all parts of the marked rows, in memory order. A part is a vector or a
   // single number. value: of the part's type. global, shared: where it lies. A part that reaches into the next row is
-  // visited where either row is marked or, with kExact, number by number where only one is.
+  // visited if either row is marked or, with kExact, number by number if only one is.
   template <bool kExact, class Global, class Shared, class Visit>
   __device__ void for_each_part(unsigned marked, Global global, Shared shared, Visit visit) const {
     if constexpr (kVectors) {

@@ -161,7 +161,7 @@ std::vector<ColmapImage> parse_images_text(LineCursor cursor) {
     check_image(cursor, image);
     images.push_back(std::move(image));
 
-    // The line of observations is there even where it is empty; without it the next image would be lost.
+    // The line of observations is there even if it is empty; without it the next image would be lost.
     if (!cursor.next_line()) break;
     std::size_t num_fields = 0;
     for (; cursor.has_field(); cursor.field("an observation")) ++num_fields;

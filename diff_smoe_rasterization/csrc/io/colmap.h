@@ -8,7 +8,7 @@
 #include <string_view>
 #include <vector>
 
-#include "io/point_cloud.h"
+#include "io/ply.h"
 
 namespace dsmoe::io {
 
@@ -16,7 +16,7 @@ struct CameraModel {
   int id;
   const char* name;
   int num_params;
-  int num_focal_lengths;  // they come first in the parameters; 0 where the model has none
+  int num_focal_lengths;  // they come first in the parameters; 0 if the model has none
 };
 
 /// Returns COLMAP's camera model of that number or name, or null.
@@ -54,14 +54,14 @@ struct ColmapModel {
 enum class ColmapFormat { kBinary, kText };
 
 /// Returns the first of folder, folder/sparse/0 and folder/sparse that holds cameras.bin or cameras.txt.
-/// Throws FileError naming all three where none does.
+/// Throws FileError naming all three if none does.
 std::string find_colmap_folder(const std::string& folder);
 
-/// Reads the three files of exactly this folder; binary where cameras.bin is there, text otherwise.
+/// Reads the three files of exactly this folder; binary if cameras.bin is there, text otherwise.
 /// Throws FileError for a missing file, FormatError for a malformed one and for a model without cameras or images.
 ColmapModel read_colmap(const std::string& folder);
 
-/// Reads one file of cameras, text where the name ends in ".txt". Throws FileError, FormatError.
+/// Reads one file of cameras, text if the name ends in ".txt". Throws FileError, FormatError.
 std::vector<ColmapCamera> read_colmap_cameras(const std::string& path);
 
 /// The three readers on the bytes of a file, which `file` names in errors. Throw FormatError.
@@ -69,8 +69,8 @@ std::vector<ColmapCamera> parse_colmap_cameras(std::string_view bytes, const std
 std::vector<ColmapImage> parse_colmap_images(std::string_view bytes, const std::string& file, ColmapFormat format);
 ColmapPoints parse_colmap_points(std::string_view bytes, const std::string& file, ColmapFormat format);
 
-/// Writes the three files into a folder, which is made where it is missing. Images get no observations, points no
-/// tracks, black where the cloud has no colours and COLMAP's -1 where it has no errors. Throws FileError, FormatError.
+/// Writes the three files into a folder, which is made if it is missing. Images get no observations, points no
+/// tracks, black if the cloud has no colours and COLMAP's -1 if it has no errors. Throws FileError, FormatError.
 void write_colmap(const std::string& folder, const ColmapModel& model, ColmapFormat format);
 
 }  // namespace dsmoe::io

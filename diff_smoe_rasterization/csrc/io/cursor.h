@@ -1,20 +1,46 @@
-// Cursors over the bytes of a file: they check every step and name file and place in every error.
+// Numbers in files, and cursors over the bytes of a file: they check every step and name file and place in every error.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <string>
 #include <string_view>
 
-#include "io/byte_order.h"
 #include "io/file.h"
 
 namespace dsmoe::io {
 
+enum class ByteOrder { kLittleEndian, kBigEndian };
+
+inline ByteOrder host_byte_order() {
+  const std::uint16_t one = 1;
+  unsigned char first = 0;
+  std::memcpy(&first, &one, 1);
+  return first == 1 ? ByteOrder::kLittleEndian : ByteOrder::kBigEndian;
+}
+
+template <typename T> T load(const char* bytes, ByteOrder order = ByteOrder::kLittleEndian) {
+  char copy[sizeof(T)];
+  std::memcpy(copy, bytes, sizeof(T));
+  if (order != host_byte_order()) std::reverse(copy, copy + sizeof(T));
+  T value;
+  std::memcpy(&value, copy, sizeof(T));
+  return value;
+}
+
+template <typename T> void append_little_endian(std::string& bytes, T value) {
+  char copy[sizeof(T)];
+  std::memcpy(copy, &value, sizeof(T));
+  if (host_byte_order() != ByteOrder::kLittleEndian) std::reverse(copy, copy + sizeof(T));
+  bytes.append(copy, sizeof(T));
+}
+
 /// Returns text from a file as it may stand in a message: quoted, short, unprintable bytes as \xNN.
 std::string printable(std::string_view text);
 
-/// Parses the whole of `text`, in the C locale whatever the program's. False where it is no such number or out of
+/// Parses the whole of `text`, in the C locale whatever the program's. False if it is no such number or out of
 /// range.
 bool parse_number(std::string_view text, double& value);
 bool parse_whole(std::string_view text, std::uint64_t& value);
@@ -41,7 +67,7 @@ class ByteCursor {
   /// Steps over `count` records and returns where they begin.
   const char* take(std::uint64_t count, std::size_t record_bytes, const char* what);
 
-  /// Throws where bytes are left: then a count was wrong, and what was read is not what was written.
+  /// Throws if bytes are left: then a count was wrong, and what was read is not what was written.
   void end_of_data(const char* what) const;
 
   /// Reads up to a NUL, which is stepped over and not returned.
@@ -78,7 +104,7 @@ class LineCursor {
   std::uint64_t whole(const char* what, std::uint64_t maximum = UINT64_MAX);
   /// All that is left of the line, without the blanks around it.
   std::string_view rest();
-  /// Throws where the line has a further field.
+  /// Throws if the line has a further field.
   void end_of_line(const char* what);
 
   [[noreturn]] void fail(const std::string& what, const std::string& reason) const;

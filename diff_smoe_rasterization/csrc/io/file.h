@@ -45,7 +45,7 @@ class OutputFile {
 
   void write(std::string_view bytes) { stream_.write(bytes.data(), static_cast<std::streamsize>(bytes.size())); }
 
-  /// Throws FileError where any write failed (a full disk shows here).
+  /// Throws FileError if any write failed (a full disk shows here).
   void commit();
 
  private:

@@ -43,7 +43,7 @@ int sh_degree_of(const PlyVertices& vertices) {
                 " properties f_rest_*; it must have 0, 9, 24 or 45 (SH degree 0 to 3)");
 }
 
-/// Returns the blend mode that the comments record, or an empty string. Throws where they record two.
+/// Returns the blend mode that the comments record, or an empty string. Throws if they record two.
 std::string recorded_blend_mode(const std::vector<std::string>& comments, const std::string& file) {
   std::string mode;
   for (const std::string& comment : comments) {
@@ -58,8 +58,8 @@ std::string recorded_blend_mode(const std::vector<std::string>& comments, const 
   return mode;
 }
 
-/// Returns the background gate that the comments record, if any. Throws where they record two, or what is none.
-/// lines: the comments' line numbers, for errors; empty where they are not from a file.
+/// Returns the background gate that the comments record, if any. Throws if they record two, or what is none.
+/// lines: the comments' line numbers, for errors; empty if they are not from a file.
 std::optional<double> recorded_background_gate(const std::vector<std::string>& comments,
                                                const std::vector<std::size_t>& lines, const std::string& file) {
   std::optional<double> gate;
@@ -151,7 +151,7 @@ void write_gaussians(const std::string& path, const GaussianModel& model) {
   };
   if (!model.blend_mode.empty()) record(std::string(kBlendModeKey) + model.blend_mode);
   if (model.background_gate) record(std::string(kBackgroundGateKey) + " " + shortest_text(*model.background_gate));
-  recorded_blend_mode(comments, path);  // throw where the caller's comments name another mode or gate
+  recorded_blend_mode(comments, path);  // throw if the caller's comments name another mode or gate
   recorded_background_gate(comments, {}, path);
 
   std::vector<PlyColumn> columns;

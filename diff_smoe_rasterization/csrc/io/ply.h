@@ -2,13 +2,21 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <optional>
 #include <string>
 #include <vector>
 
-#include "io/point_cloud.h"
-
 namespace dsmoe::io {
+
+/// Points of a PLY file or of a COLMAP model, in the file's order; every position is finite.
+struct PointCloud {
+  std::size_t count = 0;
+  std::vector<double> positions;      // [N, 3] world
+  std::vector<std::uint8_t> colors;   // [N, 3] red, green, blue; empty if the file has none
+  std::vector<float> normals;         // [N, 3]; empty if the file has none
+  std::vector<std::string> comments;  // of the PLY header
+};
 
 /// A trained model as Inria's 3DGS stores it: raw parameters, before sigmoid, exp and normalisation.
 /// Values may be NaN or infinite; the rasterizer culls such Gaussians.
@@ -34,16 +42,16 @@ GaussianModel read_gaussians(const std::string& path);
 GaussianModel parse_gaussians(std::string bytes, const std::string& file);
 
 /// Writes binary little endian float32 columns in Inria's order, normals zero. Blend mode and background gate become
-/// comment lines; the gate is read back as the same double. Throws FileError; FormatError where a vector has not the
-/// size that count and sh_degree ask for, and where the comments record something else.
+/// comment lines; the gate is read back as the same double. Throws FileError; FormatError if a vector has not the
+/// size that count and sh_degree ask for, and if the comments record something else.
 void write_gaussians(const std::string& path, const GaussianModel& model);
 
-/// Reads x y z and, where present, red green blue (whole numbers 0 to 255) and nx ny nz.
+/// Reads x y z and, if present, red green blue (whole numbers 0 to 255) and nx ny nz.
 /// Throws FileError; FormatError, also for a position that is NaN or infinite.
 PointCloud read_points(const std::string& path);
 PointCloud parse_points(std::string bytes, const std::string& file);
 
-/// Writes x y z (float32), nx ny nz (float32) and red green blue (uchar) where the cloud has them.
+/// Writes x y z (float32), nx ny nz (float32) and red green blue (uchar) if the cloud has them.
 void write_points(const std::string& path, const PointCloud& points);
 
 }  // namespace dsmoe::io

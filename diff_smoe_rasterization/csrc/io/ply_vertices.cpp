@@ -166,7 +166,7 @@ Header read_header(LineCursor& lines) {
   lines.fail("the header", "has no end_header line (truncated file?)");
 }
 
-/// Appends a number in the host's byte order. False where `type` cannot hold it.
+/// Appends a number in the host's byte order. False if `type` cannot hold it.
 bool append_value(std::string& bytes, PlyType type, double value) {
   return with_type(type, [&](auto zero) {
     using T = decltype(zero);
@@ -180,7 +180,7 @@ bool append_value(std::string& bytes, PlyType type, double value) {
   });
 }
 
-/// Walks the rows of an ascii element, one a line; appends the scalars to `rows` where that is given.
+/// Walks the rows of an ascii element, one a line; appends the scalars to `rows` if that is given.
 void read_ascii_element(LineCursor& lines, const HeaderElement& element, std::string* rows) {
   for (std::uint64_t row = 0; row < element.count; ++row) {
     do {
@@ -205,7 +205,7 @@ void read_ascii_element(LineCursor& lines, const HeaderElement& element, std::st
   }
 }
 
-/// Walks the rows of a binary element; where it has lists, the scalars are appended to `rows` where that is given.
+/// Walks the rows of a binary element; if it has lists, the scalars are appended to `rows` if that is given.
 void read_binary_element(ByteCursor& cursor, const HeaderElement& element, ByteOrder order, std::string* rows) {
   const std::string name = "element " + printable(element.name);
   if (!element.has_lists()) {

@@ -7,7 +7,7 @@
 #include <string_view>
 #include <vector>
 
-#include "io/byte_order.h"
+#include "io/cursor.h"
 
 namespace dsmoe::io {
 

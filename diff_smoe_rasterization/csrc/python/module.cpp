@@ -76,7 +76,7 @@ py::dict saved() {
 
 // The core's list: names in the order of their numbers, each with the facts that Python asks for. `divides`: the
 // backward pass reads the images of the forward pass. `removable`: `importance` takes the mode. `background_gate`: the
-// mode's own, or None where the caller gives it. `faint_below`: what is usual in the mode.
+// mode's own, or None if the caller gives it. `faint_below`: what is usual in the mode.
 py::dict blend_modes() {
   py::dict modes;
   BlendModes::for_each([&](auto mode) {
@@ -95,7 +95,7 @@ py::dict blend_modes() {
   return modes;
 }
 
-// Raises ValueError where DSMOE_SIMD names no level of this processor.
+// Raises ValueError if DSMOE_SIMD names no level of this processor.
 py::dict build_info() {
 #ifdef DSMOE_WITH_CUDA
   constexpr bool kCudaBuilt = true;

@@ -1,18 +1,73 @@
 // What the ops refuse: absent tensors, shapes, types and devices, and on request what tensors hold. Values of numbers
-// are the core's (refuse.h). Errors name the function, the argument, what it is and what it must be. They are
-// ValueError for shapes and values, TypeError for types and devices.
+// are the core's (refuse.h). All messages have one form: "function: name is this; it must be that". They are ValueError
+// for shapes and values, TypeError for types and devices.
 #pragma once
 
 #include <cstring>
 #include <stdexcept>
 #include <string>
+#include <string_view>
 #include <type_traits>
+#include <vector>
 
-#include "check_tensor.h"
+#include "tensor.h"
 #include "tensors.h"
 
 namespace dsmoe {
 namespace binding {
+
+// "float32", as Python calls it.
+std::string dtype_name(ScalarType type);
+
+// "moments[2]".
+std::string item_name(const char* list, size_t i);
+
+// One size of an expected shape: a number, or a letter (or -1) for any.
+struct Size {
+  Size(int64_t size) : size(size), letter(size < 0 ? "any" : nullptr) {}
+  Size(const char* letter) : size(-1), letter(letter) {}
+  bool is(std::string_view other) const { return letter != nullptr && other == letter; }
+  int64_t size;
+  const char* letter;
+};
+using Shape = std::vector<Size>;
+
+inline Shape shape_of(const Sizes& sizes) { return {sizes.begin(), sizes.end()}; }
+
+bool matches(const Tensor& tensor, const Shape& shape);
+
+void check_length(const char* function, const char* list, size_t length, size_t expected);
+
+// The first row of flags [N] that is set, -1 if none is. Waits for the device.
+int64_t first_set(const Tensor& flags);
+
+constexpr ScalarType kAsLike = ScalarType::Undefined;
+
+// What holds for all tensors of one call of an op: they are of the type and on the device of one of them, `like`, and
+// none carries a tangent, which the ops would drop (NotImplementedError).
+class Expect {
+ public:
+  // function: the op that errors name. like: float32 or float64; like_name: its name.
+  Expect(const char* function, const char* like_name, const Tensor& like);
+
+  void operator()(std::string_view name, const Tensor& tensor, const Shape& shape, ScalarType type = kAsLike) const;
+
+  // The same of a tensor that is read or written where it lies.
+  void dense(std::string_view name, const Tensor& tensor, const Shape& shape, ScalarType type = kAsLike) const;
+
+  // The same of a list that has a tensor of each parameter's shape.
+  void dense_alike(const char* list, const Tensors& tensors, const Tensors& parameters) const;
+
+  const char* const function;
+
+ private:
+  void check_kind(std::string_view name, const Tensor& tensor, ScalarType type) const;
+  void check_dense(std::string_view name, const Tensor& tensor) const;
+
+  const char* const like_name_;
+  const Tensor& like_;
+  const bool tangents_;  // whether a tensor may carry one
+};
 
 // What the core refuses in `body` is a ValueError, which names the op in place of the core's function. What does not
 // fit is a RuntimeError in Python; the core's own exception would be an OverflowError.
@@ -61,7 +116,7 @@ void unpack_saved(const Expect& expect, const Saved& tensors, SavedForward& save
   });
 }
 
-// The numbers that the saved array of that name has, 0 where there is no such tensor.
+// The numbers that the saved array of that name has, 0 if there is no such tensor.
 template <class SavedForward> int64_t saved_length(const Saved& tensors, SavedForward saved, const char* wanted) {
   size_t next = 0;
   int64_t length = 0;
@@ -78,7 +133,7 @@ void refuse_non_finite(const char* function, const Inputs& inputs);
 // Under `prefiltered`: raises for a Gaussian that is not visible [N], unless its position is not finite.
 void refuse_culled(const char* function, const Inputs& inputs, const Tensor& visible);
 
-// Under `debug`: raises where a tensor holds NaN, naming it and the index. `what` begins with the function's name.
+// Under `debug`: raises if a tensor holds NaN, naming it and the index. `what` begins with the function's name.
 void refuse_nan(const std::string& what, const Tensor& tensor);
 
 }  // namespace binding

@@ -46,7 +46,7 @@
   X(bool, "bool", prefiltered)                                             \
   X(bool, "bool", for_backward) /* whether a backward pass may follow; else what only makes it faster is left out */
 
-// The images on request, [1, H, W], or [0] where the option of that name is not set: X(enumerator, name). Each is of a
+// The images on request, [1, H, W], or [0] if the option of that name is not set: X(enumerator, name). Each is of a
 // feature behind the colour's channels; in the core a flag of RasterConfig and a pointer of ImageOutputs and of
 // ImageGradients have the name too.
 #define DSMOE_FEATURE_IMAGES(X) \

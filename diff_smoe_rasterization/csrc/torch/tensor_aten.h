@@ -31,7 +31,6 @@
 #define DSMOE_CHECK_NOT_IMPLEMENTED TORCH_CHECK_NOT_IMPLEMENTED
 
 #define DSMOE_LIBRARY(m) TORCH_LIBRARY(diff_smoe_rasterization, m)
-#define DSMOE_LIBRARY_FRAGMENT(m) TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m)
 #define DSMOE_LIBRARY_IMPL(key, m) TORCH_LIBRARY_IMPL(diff_smoe_rasterization, key, m)
 
 namespace dsmoe {
@@ -76,12 +75,12 @@ inline Tensor to_cpu(const Tensor& tensor) { return tensor.cpu().contiguous(); }
 
 inline int num_threads() { return at::get_num_threads(); }
 
-// Autograd must notice where a tensor was changed in place after it was saved.
+// Autograd must notice if a tensor was changed in place after it was saved.
 inline void note_change(const Tensors& tensors) {
   for (const Tensor& tensor : tensors) tensor.unsafeGetTensorImpl()->bump_version();
 }
 
-// Whether a tensor may carry a derivative of forward mode; where it is cheap to know.
+// Whether a tensor may carry a derivative of forward mode; if it is cheap to know.
 inline bool forward_mode_is_open() { return true; }
 
 // Whether the tensor carries a derivative of forward mode.
@@ -94,7 +93,7 @@ class Arguments {
       : stack_(stack), begin_(stack.size() - op.schema().arguments().size()), next_(begin_) {}
 
   void read(OptionalTensor& value) { value = next().toOptional<Tensor>(); }
-  void read(Tensor& value) {  // undefined where it is None
+  void read(Tensor& value) {  // undefined if it is None
     const c10::IValue& argument = next();
     value = argument.isNone() ? Tensor() : argument.toTensor();
   }

@@ -17,8 +17,6 @@
 #include <utility>
 #include <vector>
 
-#include "python_errors.h"
-
 #define DSMOE_RAISE_UNLESS(kind, condition, ...) \
   if (!(condition)) ::dsmoe::binding::raise(::dsmoe::binding::kind, ::dsmoe::binding::message_of(__VA_ARGS__))
 #define DSMOE_CHECK(...) DSMOE_RAISE_UNLESS(ErrorKind::kRuntime, __VA_ARGS__)
@@ -28,11 +26,21 @@
 #define DSMOE_CHECK_NOT_IMPLEMENTED(...) DSMOE_RAISE_UNLESS(ErrorKind::kNotImplemented, __VA_ARGS__)
 
 #define DSMOE_LIBRARY(m) STABLE_TORCH_LIBRARY(diff_smoe_rasterization, m)
-#define DSMOE_LIBRARY_FRAGMENT(m) STABLE_TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m)
 #define DSMOE_LIBRARY_IMPL(key, m) STABLE_TORCH_LIBRARY_IMPL(diff_smoe_rasterization, key, m)
 
 namespace dsmoe {
 namespace binding {
+
+// What an op asks of Python if the stable ABI has no form of it. The functions are found in the Python that loads
+// the ops.
+
+enum class ErrorKind { kRuntime, kValue, kType, kIndex, kNotImplemented, kOutOfMemory };
+
+// Throws what PyTorch turns into a Python error of that kind. Needs no GIL.
+[[noreturn]] void raise(ErrorKind kind, const std::string& message);
+
+// Whether torch.autograd.forward_ad has a level open.
+bool forward_mode_is_open();
 
 using Device = torch::stable::Device;
 using Library = torch::stable::detail::StableLibrary;
@@ -133,7 +141,7 @@ class DeviceGuard {
   std::optional<torch::stable::accelerator::DeviceGuard> guard_;
 };
 
-// Autograd must notice where a tensor was changed in place after it was saved.
+// Autograd must notice if a tensor was changed in place after it was saved.
 void note_change(const Tensors& tensors);
 
 // Whether the tensor carries a derivative of forward mode.
@@ -150,7 +158,7 @@ class Arguments {
   void read(Tensors& value) {
     for (StableTensor& tensor : take<std::vector<StableTensor>>()) value.emplace_back(std::move(tensor));
   }
-  void read_optional(Tensor& value) {  // undefined where it is None
+  void read_optional(Tensor& value) {  // undefined if it is None
     std::optional<StableTensor> tensor = take<std::optional<StableTensor>>();
     value = tensor ? Tensor(*std::move(tensor)) : Tensor();
   }

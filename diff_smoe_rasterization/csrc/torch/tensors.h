@@ -47,7 +47,7 @@ template <class Body> void for_each_feature_image(const Body& body) {
 }
 
 using Inputs = std::array<Tensor, kNumInputs>;  // an absent input is an undefined tensor
-using Images = std::array<Tensor, kNumImages>;  // also their gradients, undefined where there is none
+using Images = std::array<Tensor, kNumImages>;  // also their gradients, undefined if there is none
 using Saved = Tensors;                          // the arrays of SavedForward, in the order of for_each_array
 using InputMask = std::array<bool, kNumInputs>;
 
@@ -110,7 +110,7 @@ class TensorMemory final : public Allocator {
 
   void* keep(int index, const SavedArray& array) override {
     if (saved_.size() <= static_cast<size_t>(index)) saved_.resize(index + 1);
-    saved_[index] = Tensor();  // freed before the new one, where an array is asked for again
+    saved_[index] = Tensor();  // freed before the new one, if an array is asked for again
     saved_[index] = empty(saved_shape(array), like_, scalar_type(array.type));
     return saved_[index].data_ptr();
   }
@@ -146,7 +146,7 @@ template <class S> GaussianInputs<S> gaussian_inputs(const Inputs& inputs, const
   GaussianInputs<S> out;
   out.num_gaussians = num_gaussians(inputs);
   static const S none = 0;
-  const auto array = [&](Input i) {  // not null where it is given, be it without elements
+  const auto array = [&](Input i) {  // not null if it is given, be it without elements
     return out.num_gaussians == 0 && inputs[i].defined() ? &none : data<S>(inputs[i]);
   };
   out.means3D = array(kMeans3D);
@@ -252,7 +252,7 @@ struct JointGradient {
     int64_t size;
   };
   std::vector<Part> parts;
-  Tensor whole;  // undefined where none of the parts is wanted
+  Tensor whole;  // undefined if none of the parts is wanted
 
   JointGradient(std::vector<Part> parts, const Inputs& gradients, const Tensor& like) : parts(std::move(parts)) {
     int64_t size = 0;

@@ -2,9 +2,9 @@
 #include <torch/csrc/autograd/custom_function.h>
 
 #include "call_op.h"
-#include "check_tensor.h"
-#include "dsmoe/adam.h"
+#include "checks.h"
 #include "dsmoe/torch_training.h"
+#include "dsmoe/training/adam.h"
 #include "tensors.h"
 
 namespace dsmoe {

@@ -9,13 +9,11 @@
 #include <tuple>
 #include <vector>
 
-#include "check_tensor.h"
-#include "dsmoe/adam_tensors.h"
-#include "dsmoe/gather.h"
-#include "dsmoe/gaussian_adam.h"
-#include "dsmoe/gaussians.h"
-#include "dsmoe/image_loss.h"
-#include "dsmoe/lazy_adam.h"
+#include "checks.h"
+#include "dsmoe/training/adam.h"
+#include "dsmoe/training/gather.h"
+#include "dsmoe/training/gaussians.h"
+#include "dsmoe/training/image_loss.h"
 
 namespace dsmoe {
 namespace binding {
@@ -72,7 +70,7 @@ void adam(const Tensors& parameters, const Tensors& gradients, const Tensors& mo
   for (const Tensors* list : {&parameters, &moments, &squares}) note_change(*list);
 }
 
-// Numbers that the device holds; null where there are none.
+// Numbers that the device holds; null if there are none.
 template <class S> const S* given_numbers(const OptionalTensor& numbers) {
   return numbers.has_value() ? numbers->data_ptr<S>() : nullptr;
 }
@@ -332,7 +330,7 @@ GaussianTensors activate(const Tensor& opacities, const Tensor& scales, const Te
   return values;
 }
 
-// raw: the arguments of `activate`, values: its results, dL_d...: the gradients by these, where there are any.
+// raw: the arguments of `activate`, values: its results, dL_d...: the gradients by these, if there are any.
 template <class Backend>
 GaussianTensors activate_backward(const Tensors& raw, const Tensors& values, const OptionalTensor& dL_dopacities,
                                   const OptionalTensor& dL_dscales, const OptionalTensor& dL_drotations) {

@@ -15,7 +15,7 @@ namespace dsmoe {
 // that the call has put on its stream.
 class Scratch {
  public:
-  // Returns `bytes` bytes at a multiple of 256, or null where there is no memory left.
+  // Returns `bytes` bytes at a multiple of 256, or null if there is no memory left.
   virtual void* allocate(size_t bytes) = 0;
 
  protected:
@@ -40,8 +40,8 @@ struct SavedArray {
 class Allocator : public Scratch {
  public:
   // Returns memory for array number `index` of those that `for_each_array` names, at a multiple of 256 bytes, or null
-  // where there is no memory left. It must last until the backward pass has run, or until the caller knows that none
-  // will. Where an index is asked for again, the array before it is no longer used.
+  // if there is no memory left. It must last until the backward pass has run, or until the caller knows that none
+  // will. If an index is asked for again, the array before it is no longer used.
   virtual void* keep(int index, const SavedArray& array) = 0;
 
   // Says that the callee has done with all that `allocate` has given so far. Later work on the same stream may use it.

@@ -46,7 +46,7 @@ template <class S> struct ShWriter {
 // The colours of one Gaussian. They are either given, or made of coefficients of spherical harmonics.
 template <class S> struct Colors {
   const S* given;  // [C], or null
-  const S* dc;     // [3], or null where shs holds degree 0
+  const S* dc;     // [3], or null if shs holds degree 0
   const S* shs;    // [num_sh, 3], or null
   int num_sh;      // coefficients in shs
   int sh_degree;   // active degree
@@ -91,7 +91,7 @@ template <class S> struct ColorSource {
   DSMOE_HD ShRules<S> sh_rules() const { return {colors.sh_degree, config.clamp_color, load3(camera.position)}; }
 };
 
-// Writes the features of a Gaussian, [F]: what the pixels blend of it. depth: its view z. Returns false where the
+// Writes the features of a Gaussian, [F]: what the pixels blend of it. depth: its view z. Returns false if the
 // Gaussian is culled.
 template <class S> DSMOE_HD bool write_features(const ColorSource<S>& source, S depth, S* features) {
   const Colors<S>& colors = source.colors;
@@ -195,7 +195,7 @@ template <class S> struct RenderedGaussian {
   }
 };
 
-// Projects a Gaussian, and writes its features, [F]. The radius is 0 where the Gaussian is culled. Then the rest means
+// Projects a Gaussian, and writes its features, [F]. The radius is 0 if the Gaussian is culled. Then the rest means
 // nothing.
 template <class S> DSMOE_HD Projection<S> project_gaussian(const RenderedGaussian<S>& of, S* features) {
   const Gaussian<S> gaussian = load_gaussian(of.inputs, of.index);
@@ -208,7 +208,7 @@ template <class S> DSMOE_HD Projection<S> project_gaussian(const RenderedGaussia
 template <class S> struct PixelSums {
   GateGradient<S> gate;         // by its shape and opacity on the image
   BlendedFeatures<S> features;  // and the gradients by them
-  S depth = 0;                  // by its view depth, where others than the pixels read that
+  S depth = 0;                  // by its view depth, if others than the pixels read that
 };
 
 // The gradient of Gaussian i that a record of FootprintGradients has. features: what the forward pass wrote of it.

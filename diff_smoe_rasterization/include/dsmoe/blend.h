@@ -13,7 +13,7 @@
 //
 // `smoe` is Eq. 7 as the paper's authors compute it. Their pairs are strong or tails (Cut::kStrong). The sums over i
 // are of strong pairs. B is the sum of alpha T over the tails, which takes nothing from T. So where Gaussians end,
-// those that almost reach a pixel draw it to the background. That is the rule of wide pixels. A pixel is wide where its
+// those that almost reach a pixel draw it to the background. That is the rule of wide pixels. A pixel is wide if its
 // near pairs (gate.h) have a gate sum below `faint_below`. In the others only near pairs count, and B is 0. smoe_eq7
 // has that as an option.
 //
@@ -21,7 +21,7 @@
 //
 //   C = (sum c_i w_i + (B + lambda T) bg) / D,   D = W + B + lambda T
 //
-// B is 0 but in `smoe`; `alpha` has lambda 1, where D is 1.
+// B is 0 but in `smoe`; `alpha` has lambda 1, so that D is 1.
 //
 // With g' = dL/dC / D, b = g'.C, u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j, which begins at
 // lambda T (g'.bg - b), with B held constant:
@@ -35,6 +35,7 @@
 // alpha passes the gradient straight through, as Inria's rasterizer does and a drop-in must.
 #pragma once
 
+#include <limits>
 #include <type_traits>
 
 #include "dsmoe/gate.h"
@@ -70,7 +71,7 @@ template <class Real> struct PixelEnd {
   Real transmittance;                  // T
   Real gate_sum;                       // W; ablations: sum alpha
   Scalar<Real> lambda;                 // of the background
-  Real tails = Real(Scalar<Real>(0));  // B, where the mode has tails
+  Real tails = Real(Scalar<Real>(0));  // B, if the mode has tails
 };
 
 // What a rendering keeps of a pixel's T: its sign says whether the pixel is wide. T is never 0.
@@ -83,7 +84,7 @@ template <class Real> DSMOE_HD Mask<Real> is_wide(Real kept) { return kept < Rea
 // because a pixel closes at kTransmittanceCut.
 template <class Real> struct PixelState {
   Real transmittance;  // T; negative once the pixel is full
-  Real gate_sum;       // W, accumulated: as 1 - T it would lose all digits where it is small; ablations: sum alpha
+  Real gate_sum;       // W, accumulated: as 1 - T it would lose all digits if it is small; ablations: sum alpha
 
   static DSMOE_HD PixelState open() { return {Real(Scalar<Real>(1)), Real(Scalar<Real>(0))}; }
   DSMOE_HD Mask<Real> is_open() const { return transmittance > Real(Scalar<Real>(0)); }
@@ -104,7 +105,7 @@ template <class Real> struct PixelBackward {
   Real base;           // b
 };
 
-// 0 where the pair has no part in the pixel.
+// 0 if the pair has no part in the pixel.
 template <class Real> struct PairGradient {
   Real power;   // dL/dpower = o G dL/dalpha
   Real weight;  // w; dL/dc = w g'
@@ -114,14 +115,14 @@ template <class Real> struct PairGradient {
 template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state, const Gate<Real>& gate) {
   using S = Scalar<Real>;
   const Real before = state.transmittance;
-  const Real after = before * (Real(S(1)) - gate.alpha);  // negative where the pixel is full
+  const Real after = before * (Real(S(1)) - gate.alpha);  // negative if the pixel is full
   const Mask<Real> contributes = gate.counts & (after >= Real(S(kTransmittanceCut)));
   state.transmittance = select(contributes, after, select(gate.counts, -abs(before), before));
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 
-// The reverse of transmit: recovers T in front of the pair and moves the suffix past it. logit: of the gate, or 0 where
-// the pair does not contribute. Then T stays, and so does R where u is a number. kClamps: alpha may be below the logit.
+// The reverse of transmit: recovers T in front of the pair and moves the suffix past it. logit: of the gate, or 0 if
+// the pair does not contribute. Then T stays, and so does R if u is a number. kClamps: alpha may be below the logit.
 template <bool kClamps, class Real>
 DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
   const Real one = Scalar<Real>(1), rate = fma(pixel.transmittance, u, -pixel.suffix);  // dL/dalpha times 1 - alpha
@@ -224,7 +225,7 @@ template <> struct Blend<BlendMode::kSmoeStd> : GateBlend<false, false> {
   static constexpr Law kLaw = Law::kGates;
 };
 
-// What fact(Blend<mode>()) says of a mode that is known at run time; `otherwise` where there is no such mode.
+// What fact(Blend<mode>()) says of a mode that is known at run time; `otherwise` if there is no such mode.
 template <class T, class Fact> DSMOE_HD constexpr T fact_of(BlendMode mode, T otherwise, Fact fact) {
   T found = otherwise;
   BlendModes::for_each(
@@ -247,7 +248,7 @@ DSMOE_HD constexpr float faint_below_of(BlendMode mode) {
   return fact_of(mode, kFaintEverywhere, [](auto blend) { return decltype(blend)::kFaintBelow; });
 }
 
-// Adds a pair to the sum of a pixel's tails, B, where it is a tail and the pixel is open. state: of the pixel in front
+// Adds a pair to the sum of a pixel's tails, B, if it is a tail and the pixel is open. state: of the pixel in front
 // of the pair. tail: of the pair, by tail_of.
 template <class Real> DSMOE_HD void add_tail(const PixelState<Real>& state, Real& tails, Real tail) {
   tails = fma(select(state.is_open(), tail, Real(Scalar<Real>(0))), state.transmittance, tails);
@@ -257,7 +258,7 @@ template <class Real> DSMOE_HD void add_tail(const PixelState<Real>& state, Real
 template <BlendMode kMode> constexpr bool kResumes = Blend<kMode>::kLaw == Law::kGates;
 
 // Continues a backward walk in front of pairs that another walk takes. transmittance: T in front of those pairs.
-// behind: their sum w g'.c. Where u is g'.c - b, the sum needs their sum w b too, which is b times
+// behind: their sum w g'.c. If u is g'.c - b, the sum needs their sum w b too, which is b times
 // (T in front of them - T behind them).
 template <BlendMode kMode, class Real>
 DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Real behind) {
@@ -269,5 +270,36 @@ DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Re
   }
   pixel.transmittance = transmittance;
 }
+
+// How a rendering blends: a mode and its parameters, as one value from the caller to the kernels.
+
+constexpr float kFaintBelowOfMode = -std::numeric_limits<float>::infinity();
+
+template <class S> struct BlendRules {
+  BlendMode mode = BlendMode::kAlpha;
+  S alpha_min = 0;        // SMoE modes: pairs with alpha below this do not count; in kSmoe they are tails
+  S background_gate = 0;  // lambda of kSmoe and kSmoeEq7, 0 or more
+  // kSmoe, kSmoeEq7: faint pairs and tails count in pixels whose near pairs have a smaller gate sum than this: with 2
+  // in all, with 0 in none; kFaintBelowOfMode: the mode's default
+  S faint_below = S(kFaintBelowOfMode);
+  const S* background_gate_at = nullptr;  // [1] where lambda lies instead, or null
+
+  DSMOE_HD S lambda() const { return background_gate_at != nullptr ? *background_gate_at : background_gate; }
+  DSMOE_HD AlphaCut<S> alpha_cut() const { return {alpha_min, cut_of(mode) == Cut::kKernel ? lambda() : S(0)}; }
+  DSMOE_HD S wide_below() const { return faint_below == S(kFaintBelowOfMode) ? S(faint_below_of(mode)) : faint_below; }
+  // Whether a pixel is first blended with its near pairs only.
+  DSMOE_HD bool blends_near_first() const { return near_first(mode) && wide_below() <= S(1); }
+  // The least alpha of a tail.
+  DSMOE_HD S tail_alpha() const { return S(blends_near_first() ? kTailAlpha : kEveryTailAlpha); }
+  // What the tails reach beyond the strong pairs: is added to the squared reach of a footprint when tiles are listed.
+  DSMOE_HD S tail_reach() const {
+    return has_tails(mode) ? S(2) * log(max(alpha_min, S(kStrongAlpha)) / tail_alpha()) : S(0);
+  }
+
+  // The same rules in another precision. Lambda is read: it must lie where the caller can read it.
+  template <class To> BlendRules<To> as() const {
+    return {mode, static_cast<To>(alpha_min), static_cast<To>(lambda()), static_cast<To>(faint_below), nullptr};
+  }
+};
 
 }  // namespace dsmoe

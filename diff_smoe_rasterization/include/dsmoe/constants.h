@@ -8,13 +8,13 @@ constexpr float kAlphaMax = 0.99f;          // alpha never reaches 1, so that tr
 constexpr float kAlphaCut = 1.0f / 255.0f;  // `alpha` mode skips fainter pairs: invisible in 8 bits
 constexpr float kGateCut = 1e-5f;           // `smoe_eq7` and the ablations skip smaller kernels G (the paper's text)
 // `smoe`, the rule of the paper's authors: a pair of alpha >= kStrongAlpha is strong. A weaker one is a tail: it only
-// adds to the background's weight. Where a tail matters some pair is strong, so that the denominator is at least
-// kStrongAlpha. So a tail below kTailAlpha moves a pixel by less than 1/255. Where a caller wants all pairs in every
+// adds to the background's weight. If a tail matters some pair is strong, so that the denominator is at least
+// kStrongAlpha. So a tail below kTailAlpha moves a pixel by less than 1/255. If a caller wants all pairs in every
 // pixel, it also wants all tails that a float32 pixel can feel: 2^-35 is half a unit of the last digit of kStrongAlpha.
 constexpr float kStrongAlpha = 1.0f / 2040.0f;
 constexpr float kTailAlpha = 1.0f / (2040.0f * 255.0f);
 constexpr float kEveryTailAlpha = 0x1p-35f;
-// Faint pairs and tails count where the gate sum of the near pairs is below this, unless a caller says otherwise. 0.9
+// Faint pairs and tails count if the gate sum of the near pairs is below this, unless a caller says otherwise. 0.9
 // has the same quality and takes 1.2 to 1.3 times as long; 0.1 loses 0.1 dB (benchmarks/NOTES.md).
 constexpr float kFaintBelow = 0.25f;
 constexpr float kFaintEverywhere = 2.0f;  // no gate sum of a mode that has faint pairs is above 1
@@ -26,7 +26,7 @@ constexpr float kCoreKernel = 0.011108996538242306f;
 constexpr float kCoreAlpha = 1.0f / 1020.0f;
 constexpr double kLog2AlphaCut = -7.994353351539342, kLog2CoreAlpha = kLog2AlphaCut - 2;  // of the two floats
 constexpr double kLog2CoreKernel = -6.492127708889321;                                    // of the float
-constexpr float kTransmittanceCut = 1e-4f;     // a pixel is full where the next pair would leave less
+constexpr float kTransmittanceCut = 1e-4f;     // a pixel is full if the next pair would leave less
 constexpr float kMaxOpacity = 1e20f;           // with a larger opacity, gradients by a place overflow in float
 constexpr float kGateSumCut = 1e-30f;          // below it no gate is open: the pixel takes the background
 constexpr float kRadiusRootFloor = 0.1f;       // keeps the larger eigenvalue's root real for round Gaussians

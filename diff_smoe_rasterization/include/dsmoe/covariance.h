@@ -105,7 +105,7 @@ template <class S> DSMOE_HD Sym2<S> covariance_2d(const ImageFactor<S>& factor) 
 template <class S> struct Conic {
   Sym2<S> inverse;   // per px^2
   Sym2<S> filtered;  // Sigma2D + low-pass, px^2
-  S determinant;     // of filtered; there is no footprint where it is not above 0
+  S determinant;     // of filtered; there is no footprint if it is not above 0
   S unfiltered;      // the determinant of Sigma2D
 };
 
@@ -206,7 +206,7 @@ template <class S> struct ImageFactorGradient {
 };
 
 // dL/dR_ij = 2 s_j^2 (M_i^T H t_j), where M_i and t_j are columns of M and of M R. It is symmetric to the last bit
-// where R is 1 and all s are equal. So the unturned quaternion of a round Gaussian has a gradient of exactly 0.
+// if R is 1 and all s are equal. So the unturned quaternion of a round Gaussian has a gradient of exactly 0.
 template <class S>
 DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation,
                                                       const ImageFactor<S>& factor, const ImageGradient<S>& h) {
@@ -227,7 +227,7 @@ DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3
   // M_i^T adj(Sigma2D) t_j
   const auto adjugate = [&](int i, int j) {
     const int k = (j + 1) % 3, l = (j + 2) % 3;
-    // The cross product of t_c and M_i, the same bits as the minor where M is t.
+    // The cross product of t_c and M_i, the same bits as the minor if M is t.
     const auto across = [&](int c) {
       const Vec2<S>&p = t.of[c], &q = m.of[i];
       const bool forward = i == (c + 1) % 3;

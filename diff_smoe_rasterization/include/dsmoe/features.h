@@ -1,4 +1,4 @@
-// The features of a rendering by number: colour channels, then z and 1 / z where they are asked for.
+// The features of a rendering by number: colour channels, then z and 1 / z if they are asked for.
 #pragma once
 
 #include "dsmoe/params.h"

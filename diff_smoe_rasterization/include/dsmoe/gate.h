@@ -41,7 +41,7 @@ template <class Real, class S> struct ColumnExponent {
 // The least alpha that counts, in addition to the cut.
 template <class S> struct AlphaCut {
   S alpha_min;  // the caller's
-  S faint;      // where pairs are cut by G: lambda / 255, and nothing inside 3 sigma
+  S faint;      // if pairs are cut by G: lambda / 255, and nothing inside 3 sigma
 
   DSMOE_HD AlphaCut(S alpha_min, S lambda) : alpha_min(alpha_min), faint(static_cast<float>(lambda) * kAlphaCut) {}
   DSMOE_HD S of(S opacity) const { return max(alpha_min, min(faint, opacity * S(kCoreKernel))); }
@@ -50,7 +50,7 @@ template <class S> struct AlphaCut {
 // The squared reach k^2 of a Gaussian that no pixel sees: no further reach that is added to it makes it 0.
 constexpr float kNoReach = -1e30f;
 
-// The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. Where it is negative
+// The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. If it is negative
 // no pair counts.
 template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
   if (!(opacity > S(0))) return S(kNoReach);
@@ -62,7 +62,7 @@ template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
   return least_alpha > S(0) ? min(by_gate, by_alpha) : by_gate;
 }
 
-// A pair that counts is near where alpha >= 1/255, and within 3 sigma where alpha >= 1/1020; else it is faint. A mode
+// A pair that counts is near if alpha >= 1/255, and within 3 sigma if alpha >= 1/1020; else it is faint. A mode
 // with kNearFirst blends the faint pairs of a pixel only where its near pairs have a small gate sum.
 //
 // The least alpha of a near pair. least_alpha: of a pair that counts.
@@ -87,7 +87,7 @@ template <class Real> struct Gate {
 // One whose alpha is o G.
 template <class Real> struct UnclampedGate : Gate<Real> { static constexpr bool kClamps = false; };
 
-// The alpha of a pair that is a tail; 0 where it is strong, or below tail_alpha (BlendRules). counts: by Cut::kStrong.
+// The alpha of a pair that is a tail; 0 if it is strong, or below tail_alpha (BlendRules). counts: by Cut::kStrong.
 template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> inside, Scalar<Real> tail_alpha) {
   using S = Scalar<Real>;
   const Mask<Real> felt = inside & (gate.logit >= Real(tail_alpha));
@@ -97,7 +97,7 @@ template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> i
 template <class Real> DSMOE_HD Real clamped(Real logit) { return min(logit, Real(Scalar<Real>(kAlphaMax))); }
 
 template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
-  // Where the exponent is above 0 the conic is no ellipse. Such a pair does not count, and must not overflow either.
+  // If the exponent is above 0 the conic is no ellipse. Such a pair does not count, and must not overflow either.
   const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
@@ -127,12 +127,12 @@ template <class S> struct LogGate {
 
   template <class Real> DSMOE_HD ColumnExponent<Real, S> column(Real dx) const { return {factors, dx, greatest}; }
 
-  // As near_alpha. It is the same number again where `least` is that of a near pair.
+  // As near_alpha. It is the same number again if `least` is that of a near pair.
   DSMOE_HD S near_least() const {
     return max(least, min(S(kLog2AlphaCut), max(S(kLog2CoreAlpha), greatest + S(kLog2CoreKernel))));
   }
 
-  // Where log_logit is above log2(o) the conic is no ellipse. Such a pair does not count. least: of a pair that counts.
+  // If log_logit is above log2(o) the conic is no ellipse. Such a pair does not count. least: of a pair that counts.
   template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit, Real least) const {
     Gate<Real> gate;
     gate.logit = exp2(log_logit);
@@ -162,7 +162,7 @@ template <class Real, class S> DSMOE_HD Vec2<Real> power_by_mean(const ExponentF
   return {-by_x, -by_y};
 }
 
-// Sums over pixels of |dL/dmean|, each axis apart: they do not cancel where pixels pull a centre to and fro.
+// Sums over pixels of |dL/dmean|, each axis apart: they do not cancel if pixels pull a centre to and fro.
 constexpr int kNumAbsoluteSums = 2;
 
 template <class S> struct GateGradient {

@@ -1,7 +1,7 @@
 // What goes in and out of the rasterizer, as plain structs of pointers. Every array is dense and row-major; N is the
 // number of Gaussians, F the number of features (colour channels, then z and 1/z on request), I of tile instances.
 //
-// A pointer may be null where its comment or that of its struct says so, and where its array has no elements. No other
+// A pointer may be null if its comment or that of its struct says so, and if its array has no elements. No other
 // may: the passes of rasterize.h and rasterize_cuda.h refuse it.
 #pragma once
 
@@ -10,7 +10,7 @@
 #include <optional>
 #include <string_view>
 
-#include "dsmoe/blend_rules.h"
+#include "dsmoe/blend.h"
 #include "dsmoe/project.h"
 
 namespace dsmoe {
@@ -50,8 +50,8 @@ template <class S> struct GaussianInputs {
   const S* rotations = nullptr;       // [N, 4] (w, x, y, z), used as given; null with cov3D_precomp
   const S* cov3D_precomp = nullptr;   // [N, 6] (xx, xy, xz, yy, yz, zz), or null
   const S* colors_precomp = nullptr;  // [N, C], null with shs or dc
-  const S* dc = nullptr;              // [N, 3] degree 0, or null where shs holds it
-  const S* shs = nullptr;             // [N, K, 3]; null with colors_precomp, and where dc has all there is
+  const S* dc = nullptr;              // [N, 3] degree 0, or null if shs holds it
+  const S* shs = nullptr;             // [N, K, 3]; null with colors_precomp, and if dc has all there is
   int num_sh = 0;                     // K
   int sh_degree = 0;                  // active degree, 0 to 3; dc and shs have (degree + 1)^2 coefficients or more
 };
@@ -106,7 +106,7 @@ struct SavedSizes {
   int64_t num_features = 0;    // F; -1: not known
   int64_t tiles = 0;           // of the image
   int64_t pixels = 0;          // H W
-  int64_t num_instances = -1;  // I where lists are kept; -1: not known yet
+  int64_t num_instances = -1;  // I if lists are kept; -1: not known yet
   bool tails = false;          // the mode has them
 };
 
@@ -138,7 +138,7 @@ struct StageTimes {
 
 template <class S> struct ImageOutputs {
   S* color = nullptr;          // [C, H, W]
-  S* depth = nullptr;          // [H, W], or null where the config does not ask for it
+  S* depth = nullptr;          // [H, W], or null if the config does not ask for it
   S* inverse_depth = nullptr;  // [H, W], likewise
   int32_t* radii = nullptr;    // [N] pixels
   S* gate_sum = nullptr;       // [H, W] the alpha image: W, or W / D in a mode with tails
@@ -175,7 +175,7 @@ template <class S> struct ImportanceMap {
 
 // Per pixel; both are written whole.
 struct GateMap {
-  int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 where none is
+  int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 if none is
   int32_t* counts = nullptr;     // [H, W] how many Gaussians the numerator has
 };
 

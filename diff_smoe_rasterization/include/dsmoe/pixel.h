@@ -13,7 +13,7 @@ enum class FeatureRule {
   kAveraged,  // divided by the gate sum in every mode: expected depth
 };
 
-// A feature of a pixel is (sum + weight background) / denominator where some gate is open, else its background.
+// A feature of a pixel is (sum + weight background) / denominator if some gate is open, else its background.
 template <class Real> struct FeatureEnd {
   Real weight;  // of the background: lambda T + B
   Real moving;  // lambda T, the part of it that moves with the pairs
@@ -21,7 +21,7 @@ template <class Real> struct FeatureEnd {
   Mask<Real> open;
   bool divides;
 
-  // The background's share: 0 without a gate, even where the background is NaN or infinite.
+  // The background's share: 0 without a gate, even if the background is NaN or infinite.
   DSMOE_HD Real if_gated(Real share) const {
     return select(weight > Real(Scalar<Real>(0)), share, Real(Scalar<Real>(0)));
   }
@@ -34,7 +34,7 @@ DSMOE_HD FeatureEnd<Real> feature_end(FeatureRule rule, const PixelEnd<Real>& en
   const S gate = averaged ? S(0) : Blend<kMode>::background_gate(end.lambda);
   const Real moving = Real(gate) * end.transmittance;
   const Real weight = Blend<kMode>::kTails && !averaged ? moving + end.tails : moving;
-  // Where nothing is divided the gate sum is not read: it is an image of the caller's, who may have changed it.
+  // If nothing is divided the gate sum is not read: it is an image of the caller's, who may have changed it.
   const S least = divides ? S(kGateSumCut) : S(-INFINITY);
   return {weight, moving, divides ? end.gate_sum + weight : Real(S(1)), end.gate_sum >= Real(least), divides};
 }

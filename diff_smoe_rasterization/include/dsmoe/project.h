@@ -41,7 +41,7 @@ template <class S> struct alignas(16) ProjectedGaussian {
 constexpr int kProjectedGaussianSize = 8;
 
 template <class S> struct Projection {
-  int32_t radius;  // pixels; 0 where the Gaussian is culled: then the rest means nothing
+  int32_t radius;  // pixels; 0 if the Gaussian is culled: then the rest means nothing
   ProjectedGaussian<S> gaussian;
 };
 
@@ -60,7 +60,7 @@ template <class S> DSMOE_HD bool is_finite(const Gaussian<S>& g) {
   return all_finite(shape, 7);
 }
 
-// The tiles that may hold pairs of a Gaussian. mean and radius: pixels. The radius is only read where the mode is
+// The tiles that may hold pairs of a Gaussian. mean and radius: pixels. The radius is only read if the mode is
 // within_radius().
 template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, TileGrid grid, Vec2<S> mean, S radius) {
   if (within_radius(mode)) return radius_rect(mean, radius, grid);
@@ -69,11 +69,11 @@ template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, TileGrid grid, 
 
 // A Gaussian's covariance on the image plane, and what the backward pass needs of its making.
 template <class S> struct Covariances {
-  Vec3<S> scale;     // modified; where the covariance is not given
-  Mat3<S> rotation;  // where the covariance is not given
+  Vec3<S> scale;     // modified; if the covariance is not given
+  Mat3<S> rotation;  // if the covariance is not given
   ProjectionJacobian<S> jacobian;
   Mat23<S> axes;
-  ImageFactor<S> factor;  // where the covariance is not given
+  ImageFactor<S> factor;  // if the covariance is not given
   Sym2<S> image;          // px^2, before the low-pass filter
   Conic<S> conic;
 };
@@ -127,7 +127,7 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
 // What comes back from a Gaussian's pixels.
 template <class S> struct ProjectedGradient {
   GateGradient<S> gate;
-  S depth, inverse_depth;  // by z and 1 / z; 0 where nothing asks for them
+  S depth, inverse_depth;  // by z and 1 / z; 0 if nothing asks for them
   Vec3<S> color;           // by the mean, on the way of the colour
 };
 
@@ -135,9 +135,9 @@ template <class S> struct GaussianGradient {
   Vec3<S> mean;
   Vec2<S> mean2D;  // dL/dpixel times (W / 2, H / 2): what densification reads
   S opacity;
-  Vec3<S> scale;  // where the covariance is not given
+  Vec3<S> scale;  // if the covariance is not given
   Vec4<S> rotation;
-  Sym3<S> covariance;  // where it is given
+  Sym3<S> covariance;  // if it is given
   CameraShare<S> camera;
 };
 

@@ -36,7 +36,7 @@ using dsmoe::Gradients;
 template <class S> using Frame = RenderingFrame<S, Camera<S>, SavedForward<S>>;
 
 // Renders frame.inputs to frame.images and fills frame.saved. times: is added to, or null.
-// Where there are more than config.most_instances, no lists are kept, and each pass makes them band by band.
+// If there are more than config.most_instances, no lists are kept, and each pass makes them band by band.
 // Throws std::bad_alloc, and what `bin` throws.
 template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
 
@@ -48,7 +48,7 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& grad
 // Gaussians, of the camera the image's size. Footprints of equal depth are blended in their order. Throws as `forward`.
 template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
 
-// Writes footprints.records, zeros where no pixel saw the footprint, and of gradients.inputs the background. `frame` is
+// Writes footprints.records, zeros if no pixel saw the footprint, and of gradients.inputs the background. `frame` is
 // as `blend_footprints` left it.
 template <class S>
 void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
@@ -90,7 +90,7 @@ class Heap final : public Allocator {
   std::vector<void*> blocks_;
 };
 
-// Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are; 0 where
+// Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are; 0 if
 // saved.instance_offsets is null, because they are not counted then.
 template <class S> int64_t project(const Frame<S>& frame, StageTimes* times = nullptr);
 
@@ -98,7 +98,7 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times = nu
 template <class S> int64_t count_instances(const Frame<S>& frame, StageTimes* times = nullptr);
 
 // Fills saved.tile_offsets and saved.instances: the tile lists, front to back. Throws std::overflow_error, naming the
-// count, where the instances do not fit 32-bit slots.
+// count, if the instances do not fit 32-bit slots.
 template <class S> void bin(const Frame<S>& frame, StageTimes* times = nullptr);
 
 // Fills frame.images but the radii, and what saved has for each pixel.
@@ -107,11 +107,11 @@ template <class S> void blend(const Frame<S>& frame, StageTimes* times = nullptr
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say. Of the frame it reads the number of
 // Gaussians and the image's size; of config the blend's rules, num_threads and most_instances; of saved all
-// but features, sums, gate_sum and tails; and of images the radii, where no lists are kept.
+// but features, sums, gate_sum and tails; and of images the radii, if no lists are kept.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map);
 
 // Walks the tile lists once more, and sums what each Gaussian is worth to the image. `frame` is as `forward` left it;
-// of its images the gate sum is read, through saved, and the radii where no lists are kept.
+// of its images the gate sum is read, through saved, and the radii if no lists are kept.
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map);
 
 // Walks the tile lists once more, and finds in each pixel the Gaussian with the greatest gate. It reads of the frame

@@ -11,7 +11,7 @@
 //
 // The stages that all these run, in their order, are declared below and can be called one by one.
 //
-// A capacity that turns out too small costs time, not correctness: where the instances do not fit, the blend reads the
+// A capacity that turns out too small costs time, not correctness: if the instances do not fit, the blend reads the
 // depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
 // its inputs change.
 //
@@ -48,7 +48,7 @@ template <class S> struct DeviceCamera {
 DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features + 3) / 4 * 4; }
 
 // The backward pass of float and kFastFeatures features walks lists longer than this in segments. All others it walks
-// whole, and all lists where Run::deterministic is set: a segment begins with another rounding of T than a whole walk
+// whole, and all lists if Run::deterministic is set: a segment begins with another rounding of T than a whole walk
 // has there, and lists that do not fit their memory have no segments.
 constexpr int kSegmentLength = 512;
 constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kFastFeatures);  // numbers
@@ -63,7 +63,7 @@ template <class S> struct SavedForward {
   int64_t* num_ordered = nullptr;             // [1] entries of order; culled Gaussians have none in a depth order
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   int32_t* tile_order = nullptr;              // [tiles] those with the longest lists first
-  int64_t* num_instances = nullptr;           // [1] room that the lists need; where they have less, none is listed
+  int64_t* num_instances = nullptr;           // [1] room that the lists need; if they have less, none is listed
   int32_t* instances = nullptr;               // [capacity] Gaussians by tile, front to back
   int64_t capacity = 0;              // 0: no lists are kept. Each pass makes them, for some rows of tiles at a time
   TileBand band;                     // the rows of tiles that tile_offsets and instances are of
@@ -137,7 +137,7 @@ template <class S>
 void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory);
 
 // How many tile instances a rendering of this size, blend mode (as a number) and about so many Gaussians had at most
-// lately, as far as the current device has counted; -1 where nothing is known. Does not wait. A captured graph whose
+// lately, as far as the current device has counted; -1 if nothing is known. Does not wait. A captured graph whose
 // lists have less room is slow.
 int64_t recent_instances(int64_t width, int64_t height, int64_t blend_mode, int64_t num_gaussians);
 
@@ -152,7 +152,7 @@ template <class S> void project_footprints(const Frame<S>& frame, const Run& run
 // in their order. It waits and throws as `forward` does.
 template <class S> void blend_footprints(Frame<S>& frame, const Run& run, Allocator& memory);
 
-// Writes footprints.records, zeros where no pixel saw the footprint, and of gradients.inputs the background. `frame` is
+// Writes footprints.records, zeros if no pixel saw the footprint, and of gradients.inputs the background. `frame` is
 // as `blend_footprints` left it.
 template <class S>
 void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
@@ -195,7 +195,7 @@ class StreamMemory final : public Allocator {
   std::vector<void*> scratch_, kept_;
 };
 
-// Whether the mode needs saved.order to be the depth order. Where it does not, `project` fills saved.order, if there is
+// Whether the mode needs saved.order to be the depth order. If it does not, `project` fills saved.order, if there is
 // any, with 0, 1, 2, ..., and culled Gaussians keep their places.
 bool needs_depth_order(BlendMode mode);
 
@@ -208,10 +208,10 @@ struct Work {
 };
 
 // Fills frame.saved.projected, frame.saved.features, frame.images.radii and depths. depths: [N] what the depth sort
-// sorts, the greatest number for culled Gaussians; null where no depth order is wanted.
+// sorts, the greatest number for culled Gaussians; null if no depth order is wanted.
 template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, const Work& work);
 
-// Fills only frame.images.radii, where there are at most kMostHeldFeatures features.
+// Fills only frame.images.radii, if there are at most kMostHeldFeatures features.
 constexpr int kMostHeldFeatures = 8;
 template <class S> void project_radii(const Frame<S>& frame, const Work& work);
 
@@ -222,7 +222,7 @@ template <class S> void key_footprints(const Frame<S>& frame, DepthBits<S>* dept
 template <class S> void sort_by_depth(const Frame<S>& frame, const DepthBits<S>* depths, const Work& work);
 
 // Fills only frame.saved.num_instances, for a caller that wants as much memory as is needed: with the number of
-// instances or, where that is more, of entries in the lists of macro tiles (csrc/cuda/macro_lists.cu). work.scratch is
+// instances or, if that is more, of entries in the lists of macro tiles (csrc/cuda/macro_lists.cu). work.scratch is
 // needed.
 template <class S> void count_instances(const Frame<S>& frame, const Work& work);
 
@@ -230,7 +230,7 @@ template <class S> void count_instances(const Frame<S>& frame, const Work& work)
 template <class S> void bin(const Frame<S>& frame, const Work& work);
 
 // Fills frame.images but the radii, and what saved has for each pixel. This pass and those below make the lists, band
-// by band, where frame.saved.capacity is 0. In a mode with tails saved.sums is the caller's, and set_sums makes
+// by band, if frame.saved.capacity is 0. In a mode with tails saved.sums is the caller's, and set_sums makes
 // gate_sum and tails of it.
 template <class S> void blend(const Frame<S>& frame, const Work& work);
 

@@ -13,7 +13,7 @@
 //
 // In `smoe` the sum B of the tails is held constant. So B (bg - C) and B stand in front of all pairs, in A_k and D'_k.
 //
-// Where the denominator counts weights, (1 + q_k) w_k is q_k T_k with T_k in front of the pair. So all channels share a
+// If the denominator counts weights, (1 + q_k) w_k is q_k T_k with T_k in front of the pair. So all channels share a
 // factor, and its reciprocal needs no other one:
 //
 //   C'_k - C = -alpha_k (T_k (c_k - C) + A_k) / ((1 - alpha_k) D'_k)
@@ -41,7 +41,7 @@ template <class Real> struct Importance {
   }
 };
 
-// A pair's removal. C' - C is channel_change where something is left, and else bg - C.
+// A pair's removal. C' - C is channel_change if something is left, and else bg - C.
 template <class Real> struct Removal {
   Mask<Real> takes;  // the pair has a part in the pixel
   Real weight;       // w
@@ -53,7 +53,7 @@ template <class Real> struct Removal {
   Mask<Real> left;   // something else is in the pixel
 };
 
-// total - part. Nothing where that may be the rounding of two sums of equal terms, since a pixel's only owner has to be
+// total - part. Nothing if that may be the rounding of two sums of equal terms, since a pixel's only owner has to be
 // known: two kernels may contract operations otherwise. magnified: how many times that rounding.
 template <class Real> DSMOE_HD Real rest_of(Real total, Real part, Real magnified) {
   using S = Scalar<Real>;
@@ -62,7 +62,7 @@ template <class Real> DSMOE_HD Real rest_of(Real total, Real part, Real magnifie
   return select(rest > total * Real(kRounding) * magnified, rest, Real(S(0)));
 }
 
-// Whether the algebra above holds in the mode. Where it does not, `importance` refuses the mode.
+// Whether the algebra above holds in the mode. If it does not, `importance` refuses the mode.
 template <BlendMode kMode> constexpr bool kRemovable = Blend<kMode>::kLaw == Law::kGates;
 
 // Moves `state` past a pair. end: the pixel behind its last pair. wanted: the walk has not passed the pixel's last
@@ -128,7 +128,7 @@ DSMOE_HD Real channel_change(const Removal<Real>& removal, Real distance, Real f
   return removal.scale * (Blend<kMode>::kNeedsDepthOrder ? fma(removal.value, value, motion) : motion);
 }
 
-// squared: C' - C where something is left, of all channels. alone: |bg - C|^2. share_weight, weight: of the pixel, in
+// squared: C' - C if something is left, of all channels. alone: |bg - C|^2. share_weight, weight: of the pixel, in
 // maps of the caller's.
 template <class Real>
 DSMOE_HD void add_pair(Importance<Real>& sum, const Removal<Real>& removal, Real squared, Real alone, Real share_weight,

@@ -20,7 +20,7 @@ struct TileGrid {
   DSMOE_HD TileGrid(int width, int height) : columns((width - 1) / kTileSize + 1), rows((height - 1) / kTileSize + 1) {}
 };
 
-// floor(x) and ceil(x), clamped to [low, high] with 0 <= low. They are defined even where x is beyond every integer.
+// floor(x) and ceil(x), clamped to [low, high] with 0 <= low. They are defined even if x is beyond every integer.
 template <class S> DSMOE_HD int floor_to_int(S x, int low, int high) {
   return static_cast<int>(clamp(x, S(low), S(high)));
 }
@@ -63,7 +63,7 @@ template <class S> class EllipseBand {
 
   DSMOE_HD S v_extent() const { return v_extent_; }
 
-  // u over v in [band.low, band.high]; empty where the band misses the ellipse.
+  // u over v in [band.low, band.high]; empty if the band misses the ellipse.
   DSMOE_HD Interval<S> over(Interval<S> band) const {
     const S low = max(band.low, -v_extent_), high = min(band.high, v_extent_);
     if (!(low <= high)) return {S(1), S(0)};

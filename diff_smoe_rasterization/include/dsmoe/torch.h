@@ -48,20 +48,20 @@ struct GaussianRasterizationSettings {
   bool antialiasing = false;         // scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
   double near = 0.2;                 // Gaussians with view depth <= near are culled
   double alpha_min = 0;              // SMoE modes: also skip alpha below this; `smoe`: such pairs are no strong ones
-  bool strict = false;               // raise where an attribute is NaN or infinite, instead of culling that Gaussian
+  bool strict = false;               // raise if an attribute is NaN or infinite, instead of culling that Gaussian
   std::string blend_mode = "alpha";  // "alpha", "smoe", "smoe_eq7", "smoe_tn" or "smoe_std"
   bool deterministic = false;        // CUDA: gradients equal bit for bit from run to run; slower
   bool clamp_color = true;           // colours from shs are at least 0
   std::optional<BackgroundGate> background_gate;  // `smoe` and `smoe_eq7` only; absent: 0
   double low_pass = 0.3;                          // px^2 added to the variances on the image
-  std::optional<double> faint_below;              // `smoe` and `smoe_eq7`: faint pairs and tails count where the gate
+  std::optional<double> faint_below;              // `smoe` and `smoe_eq7`: faint pairs and tails count if the gate
                                                   // sum of near ones is below this; absent: 0.25 and 2, everywhere
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.
 struct RasterizeArguments {
   at::Tensor means2D;                // [N, 3]; only its gradient is of use: dL/d(pixel) times (W/2, H/2), z = 0
-  at::Tensor dc;                     // [N, 1, 3] where shs [N, K - 1, 3] holds only the other coefficients
+  at::Tensor dc;                     // [N, 1, 3] if shs [N, K - 1, 3] holds only the other coefficients
   at::Tensor shs;                    // [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2
   at::Tensor colors_precomp;         // [N, C] instead of shs
   at::Tensor scales;                 // [N, 3] standard deviations, world
@@ -75,9 +75,9 @@ struct RasterizeArguments {
 /// must not be changed in place: torch then raises an error.
 struct Rendering {
   at::Tensor color;          // [C, H, W]
-  at::Tensor radii;          // [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
+  at::Tensor radii;          // [N] int32; 3-sigma radius in pixels, 0 if the Gaussian touches nothing
   at::Tensor alpha;          // [1, H, W]; W = sum alpha_i T_i; smoe: W / D; smoe_tn, smoe_std: sum alpha_i
-  at::Tensor depth;          // [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
+  at::Tensor depth;          // [1, H, W]; expected view depth sum(w z) / sum(w), 0 if nothing is hit
   at::Tensor inverse_depth;  // [1, H, W]; 1 / z blended as a colour, over background 0
 };
 
@@ -114,7 +114,7 @@ class Splats {
   /// pixel_weights: [H, W] e; undefined: 1. share_weights: [H, W] e of the shares; undefined: pixel_weights.
   Importance importance(const at::Tensor& pixel_weights = {}, const at::Tensor& share_weights = {}) const;
 
-  /// Returns gaussians [H, W] int32, which has the largest gate of the pixel, -1 where none has one; and counts [H, W]
+  /// Returns gaussians [H, W] int32, which has the largest gate of the pixel, -1 if none has one; and counts [H, W]
   /// int32, how many Gaussians are in the numerator.
   std::pair<at::Tensor, at::Tensor> gate_map() const;
 

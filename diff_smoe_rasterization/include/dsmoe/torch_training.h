@@ -29,7 +29,7 @@ at::Tensor fused_ssim(const at::Tensor& img1, const at::Tensor& img2);
 
 /// One parameter of Adam and its state.
 struct AdamParameter {
-  at::Tensor value;           // stepped in place where it has a gradient
+  at::Tensor value;           // stepped in place if it has a gradient
   double lr = 1e-3;           // learning rate
   at::Tensor moment, square;  // mean gradient and mean squared gradient; undefined before the first step
   int64_t step = 0;           // how many steps it has made

@@ -170,7 +170,7 @@ TEST_P(Modes, GradientsAreTheCores) {
   if (own.size() > 11) own[11] = background.slice(0, 3);
   const auto tensors = scene.tensors();
   constexpr size_t kBackground = 7;
-  // The ablations see it only where no gate is open, and here one is everywhere.
+  // The ablations see it only if no gate is open, and here one is everywhere.
   const bool sees_background =
       config.blend.mode != dsmoe::BlendMode::kSmoeTn && config.blend.mode != dsmoe::BlendMode::kSmoeStd;
   for (size_t i = 0; i < tensors.size(); ++i) {

@@ -198,7 +198,7 @@ void expect_cpu(const Scene<double>& of, const How& how = {}) {
   }
 }
 
-// A scene in all its modes, with and without a gate of the background where the mode has one, and with the rule for
+// A scene in all its modes, with and without a gate of the background if the mode has one, and with the rule for
 // faint pairs that is not usual in the mode.
 template <BlendMode kMode> std::vector<Scene<double>> in_mode(Scene<double> scene) {
   scene.config.blend.mode = kMode;
@@ -411,7 +411,7 @@ TEST(Kernels, PackNoFootprintsThatAreNotThere) {
   }
 }
 
-// Where pixels do not stop, both passes evaluate all pairs of the entries that meet a square.
+// If pixels do not stop, both passes evaluate all pairs of the entries that meet a square.
 TEST(Kernels, CountThePairsOfBothPasses) {
   Scene<double> scene = long_lists();
   scene.config.blend.mode = BlendMode::kSmoeTn;

@@ -4,8 +4,8 @@
 #include <numeric>
 #include <vector>
 
-#include "dsmoe/lazy_adam.h"
-#include "dsmoe/neighbors.h"
+#include "dsmoe/training/adam.h"
+#include "dsmoe/training/neighbors.h"
 #include "finite_difference.h"
 #include "refusal.h"
 

@@ -1,4 +1,4 @@
-// The two renderers of the tools: the same pictures, on the CPU and, where there is one, on a GPU.
+// The two renderers of the tools: the same pictures, on the CPU and, if there is one, on a GPU.
 #include "renderer.h"
 
 #include <gtest/gtest.h>
@@ -63,7 +63,7 @@ TEST(Renderer, OnAGpuDrawsWhatTheCpuDraws) {
       const Images actual = on_gpu->render(view);
       ASSERT_EQ(actual.color.size(), expected.color.size());
       // A pair within rounding of a threshold may count on one side only: up to 1/255 of a pixel, and one in its count.
-      // Where two gates are equal but for rounding, either is the greatest.
+      // If two gates are equal but for rounding, either is the greatest.
       const std::size_t pixels = expected.alpha.size();
       std::size_t num_different = 0;
       for (std::size_t i = 0; i < pixels; ++i) {

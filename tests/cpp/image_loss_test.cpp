@@ -1,5 +1,5 @@
 // SSIM of one pixel and its derivatives; the window.
-#include "dsmoe/ssim.h"
+#include "dsmoe/training/image_loss.h"
 
 #include <gtest/gtest.h>
 
@@ -65,7 +65,7 @@ TEST(Ssim, DerivativesMatchFiniteDifferences) {
       moved.mean_x = p[0], moved.square_x = p[1], moved.product = p[2];
       return ssim(moved).value;
     };
-    // Third derivatives reach 1e4 where the variance is small: a shorter step.
+    // Third derivatives reach 1e4 if the variance is small: a shorter step.
     expect_gradient({pixel.d_mean, pixel.d_square, pixel.d_product}, value, {m.mean_x, m.square_x, m.product}, 1e-4,
                     1e-6);
   }

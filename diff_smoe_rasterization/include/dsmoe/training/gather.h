@@ -29,7 +29,7 @@ void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& 
 namespace cuda {
 
 // The same on the current device, asynchronously on `stream`, a cudaStream_t. All pointers are to memory of the device.
-// Throws std::runtime_error where a launch fails.
+// Throws std::runtime_error if a launch fails.
 template <class S> void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows, void* stream);
 
 }  // namespace cuda

@@ -30,7 +30,7 @@ template <class S> struct MortonCodes {
   int64_t* codes;   // [N] written
 };
 
-// Asynchronous on `stream`, a cudaStream_t. Throws std::runtime_error where the launch fails.
+// Asynchronous on `stream`, a cudaStream_t. Throws std::runtime_error if the launch fails.
 template <class S> void morton_codes(const MortonCodes<S>& morton, void* stream);
 
 // The mean squared distance of each point to the kNeighbors nearest others, or to as many as there are.
@@ -42,7 +42,7 @@ template <class S> struct NeighborDistances {
   S* result;             // [N] written
 };
 
-// Asynchronous on `stream`, a cudaStream_t. Throws std::runtime_error where a launch fails.
+// Asynchronous on `stream`, a cudaStream_t. Throws std::runtime_error if a launch fails.
 template <class S> void mean_squared_distances(const NeighborDistances<S>& search, void* stream);
 
 }  // namespace cuda

@@ -1,17 +1,41 @@
-// Renderings with more tile instances than are listed at once are made in bands: rows of tiles whose instances fit. A
-// pass over such a rendering lists one band after the other, and walks each.
+// The loops of a stage over bands and tiles, and its clock.
 #pragma once
 
 #include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
 #include <memory>
 #include <mutex>
 #include <vector>
 
 #include "dsmoe/rasterize.h"
+#include "dsmoe/tiles.h"
 #include "parallel.h"
+#include "tile_kernels.h"
 
 namespace dsmoe {
 namespace cpu {
+
+// Adds the seconds between its construction and its destruction to a stage. Does nothing if no times are asked for.
+class Stopwatch {
+ public:
+  Stopwatch(StageTimes* times, double StageTimes::*stage)
+      : seconds_(times != nullptr ? &(times->*stage) : nullptr), start_(Clock::now()) {}
+  ~Stopwatch() {
+    if (seconds_ != nullptr) *seconds_ += std::chrono::duration<double>(Clock::now() - start_).count();
+  }
+  Stopwatch(const Stopwatch&) = delete;
+  Stopwatch& operator=(const Stopwatch&) = delete;
+
+ private:
+  using Clock = std::chrono::steady_clock;
+  double* seconds_;
+  Clock::time_point start_;
+};
+
+// Renderings with more tile instances than are listed at once are made in bands: rows of tiles whose instances fit. A
+// pass over such a rendering lists one band after the other, and walks each.
 
 // The tiles that may hold pairs of Gaussian i, in the rows that the frame's lists are of.
 template <class S> TileRect bounds_in(const Frame<S>& frame, int64_t i) {
@@ -62,7 +86,7 @@ inline std::vector<TileBand> cut_into_bands(const std::vector<int64_t>& rows, in
   return bands;
 }
 
-// Calls visit(frame) where the frame has lists. Else it makes the lists of one band after the other, and calls visit
+// Calls visit(frame) if the frame has lists. Else it makes the lists of one band after the other, and calls visit
 // with a frame for each, from top to bottom.
 template <class S, class Visit> void for_each_band(const Frame<S>& frame, StageTimes* times, Visit visit) {
   if (!is_banded(frame)) return visit(frame);
@@ -78,6 +102,40 @@ template <class S, class Visit> void for_each_band(const Frame<S>& frame, StageT
     bin(part, times);
     visit(part);
   }
+}
+
+// Runs a tile kernel over all tiles, each thread with its own scratch memory.
+
+// Calls body(tile, scratch) for every tile of the band that has its lists in `saved`. Returns the sum of what body
+// returns. num_features: how many features `scratch` has room for.
+template <class S, class Body>
+int64_t for_each_tile(const RasterConfig<S>& config, const SavedForward<S>& saved, int width, int height,
+                      int num_features, Body body) {
+  constexpr size_t kAlignment = 64;
+  const TileGrid grid(width, height);
+  const int64_t first = static_cast<int64_t>(grid.columns) * saved.band.begin, tiles = band_tiles(grid, saved.band);
+  std::atomic<int64_t> next{0}, total{0};
+  run_threads(static_cast<int>(std::min<int64_t>(config.num_threads, tiles)), [&](int) {
+    size_t bytes = tile_scratch_size(num_features) * sizeof(S) + kAlignment;
+    const std::unique_ptr<char[]> memory(new char[bytes]);
+    void* aligned = memory.get();
+    std::align(kAlignment, bytes - kAlignment, aligned, bytes);
+    int64_t sum = 0;
+    for (int64_t i = next++; i < tiles; i = next++) {
+      const Tile<S> tile = {config,
+                            saved,
+                            width,
+                            height,
+                            static_cast<int>(i % grid.columns),
+                            static_cast<int>(i / grid.columns) + saved.band.begin,
+                            first + i,
+                            saved.tile_offsets[i],
+                            saved.tile_offsets[i + 1]};
+      sum += body(tile, static_cast<S*>(aligned));
+    }
+    total += sum;
+  });
+  return total;
 }
 
 }  // namespace cpu
