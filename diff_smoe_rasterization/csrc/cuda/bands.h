@@ -6,7 +6,6 @@
 #include <stdexcept>
 #include <vector>
 
-#include "capture.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "scratch.h"

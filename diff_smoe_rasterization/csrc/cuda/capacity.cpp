@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 
-#include "capture.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "scratch.h"

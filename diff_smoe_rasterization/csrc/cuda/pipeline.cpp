@@ -4,7 +4,6 @@
 
 #include "../refuse.h"
 #include "capacity.h"
-#include "capture.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "event_clock.h"

@@ -5,7 +5,6 @@
 
 #include <cstdint>
 
-#include "capture.h"
 #include "check.h"
 #include "dsmoe/allocator.h"
 
