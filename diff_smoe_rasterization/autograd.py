@@ -247,9 +247,8 @@ def _fake_importance(pixel_weights, share_weights, color, gate_sum, bg, radii, *
     return tuple(pixel_weights.new_empty(radii.shape) for _ in range(3))
 
 
-def _fake_gate_map(radii, saved, background_gate, *options):
-    given = dict(zip(OPTIONS, options))
-    return tuple(radii.new_empty((given["image_height"], given["image_width"])) for _ in range(2))
+def _fake_gate_map(gate_sum, radii, *others):
+    return tuple(radii.new_empty(gate_sum.shape[1:]) for _ in range(3))
 
 
 def _on_one_device(name, fake):

@@ -140,6 +140,8 @@ class GateMap(NamedTuple):
 
     gaussians: torch.Tensor  # [H, W] int32; of the largest weight in the numerator, the nearest of equal ones; -1: none
     counts: torch.Tensor  # [H, W] int32, how many Gaussians the numerator has
+    # [H, W] int32; with it the weights, front to back (in `smoe_std` by index), reach half of their denominator; -1: none
+    medians: torch.Tensor
 
 
 FEATURE_OUTPUTS = ("depth", "inverse_depth")  # images of the op on request, in its order

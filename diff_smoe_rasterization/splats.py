@@ -80,11 +80,12 @@ class Splats:
                                            *self._options))
 
     def gate_map(self) -> GateMap:
-        """Finds the Gaussian with the largest gate in each pixel; the background is no candidate.
+        """Finds the Gaussian with the largest gate in each pixel, and the median one; the background is no candidate.
 
-        The same bits from call to call. On CUDA the host does not wait.
+        The alpha image, if it was asked for, must be as it was rendered. The same bits from call to call. On CUDA the
+        host does not wait.
         """
-        return GateMap(*_OPS.gate_map(self._radii, self._saved, self._background_gate, *self._options))
+        return GateMap(*_OPS.gate_map(self._gate_sum, self._radii, self._saved, self._background_gate, *self._options))
 
     def _of_visible(self, values: torch.Tensor) -> torch.Tensor:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""

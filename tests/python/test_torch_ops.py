@@ -132,7 +132,8 @@ def test_opcheck_of_gate_map(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
     images, saved = op_results(scene)
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.gate_map.default,
-                          op_arguments(scene, "gate_map", radii=images["radii"], saved=list(saved.values())))
+                          op_arguments(scene, "gate_map", saved=list(saved.values()),
+                                       **{name: images[name] for name in ("gate_sum", "radii")}))
 
 
 @pytest.mark.parametrize("mode", REMOVABLE_MODES)
