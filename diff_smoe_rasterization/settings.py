@@ -140,7 +140,7 @@ class GateMap(NamedTuple):
 
     gaussians: torch.Tensor  # [H, W] int32; of the largest weight in the numerator, the nearest of equal ones; -1: none
     counts: torch.Tensor  # [H, W] int32, how many Gaussians the numerator has
-    # [H, W] int32; with it the weights, front to back (in `smoe_std` by index), reach half of their denominator; -1: none
+    # [H, W] int32; with it the weights, front to back (in `smoe_std` by index), reach half of their denominator; else -1
     medians: torch.Tensor
 
 
