@@ -1,4 +1,4 @@
-"""What commands offer, and what they take where nothing is said.
+"""What commands offer, and what they take if nothing is said.
 
 The command line shows these values, and the functions that do the work have them as defaults. Here because the command
 line imports no function before it is called: torch takes seconds.

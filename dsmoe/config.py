@@ -254,7 +254,7 @@ class TrainConfig:
 
     @classmethod
     def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
-        """The options that `record` gave. Raises ValueError where one is missing: a default would be another run."""
+        """The options that `record` gave. Raises ValueError if one is missing: a default would be another run."""
         missing = sorted({option.name for option in dataclasses.fields(cls)} - {*values})
         if missing:
             raise ValueError(f"the option {', '.join(missing)} is missing")
@@ -262,7 +262,7 @@ class TrainConfig:
 
     @classmethod
     def load(cls, folder: str) -> TrainConfig:
-        """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
+        """Reads OUT/config.json. Raises ConfigError if the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
         if not is_folder(folder):
             raise ConfigError(f"{folder}: no such folder; name the output folder of `dsmoe train`")
@@ -295,7 +295,7 @@ class TrainConfig:
 
     @classmethod
     def of_run(cls, folder: str, scene_option: str, resumes: bool = False, **options: Any) -> TrainConfig:
-        """The options of the run in a folder with some set. Raises ConfigError, also where its scene is not there.
+        """The options of the run in a folder with some set. Raises ConfigError, also if its scene is not there.
 
         scene_option: what says where the scene lies now, for that error. resumes: whether that run goes on with them.
         """
@@ -328,7 +328,7 @@ class TrainConfig:
         return texts
 
     def check_continued_by(self, later: TrainConfig) -> None:
-        """Raises ConfigError where `later` cannot continue this run. Comes before `validate`, which knows no run."""
+        """Raises ConfigError if `later` cannot continue this run. Comes before `validate`, which knows no run."""
         differences = self.differences(later)
         if differences:
             raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `--resume -o "
@@ -336,21 +336,21 @@ class TrainConfig:
 
 
 def _recipe_of(strategy: str) -> Dict[str, Any]:
-    """What a strategy sets of the recipe, by option, where strategies differ."""
+    """What a strategy sets of the options of the recipe in which strategies differ."""
     recipe = "importance" if strategy == "importance" else "published"
     return {option.name: option.metadata[recipe] for option in dataclasses.fields(TrainConfig)
             if recipe in option.metadata}
 
 
 def learned_gate_of(blend_mode: str) -> Dict[str, float]:
-    """How a background gate is learned by default, where blend modes differ."""
+    """How a background gate is learned by default: the options in which blend modes differ."""
     tails = blend_mode == "smoe"
     return {"background_gate_bound": 0.0 if tails else 0.03, "background_gate_start": 0.1 if tails else 1.0,
             "background_gate_lr": 0.03 if tails else 0.01}
 
 
 def holds_run(folder: str) -> bool:
-    """Whether OUT/config.json is there. Raises TrainerError where that cannot be seen."""
+    """Whether OUT/config.json is there. Raises TrainerError if that cannot be seen."""
     return is_file(os.path.join(folder, CONFIG_NAME))
 
 

@@ -172,7 +172,7 @@ def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torc
 
 
 def _median_depth(settings: Settings, inputs: Dict[str, Any], maps: GateMap) -> torch.Tensor:
-    """Returns z [1, H, W] of the Gaussians that make pixels half full, 0 where none does; differentiable."""
+    """Returns z [1, H, W] of the Gaussians that make pixels half full, 0 if none does; differentiable."""
     means, which = inputs["means3D"], maps.medians
     if not len(means):
         return means.new_zeros(1, *which.shape)
@@ -221,7 +221,7 @@ def visible_filter(self, means3D, scales=None, rotations=None, cov3D_precomp=Non
 
     means3D: [N, 3]; scales [N, 3] with rotations [N, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]` are
     taken as they are. Which radii are 0 depends on the blend mode: the anchors need that of their rendering.
-    Raises ValueError or TypeError where arguments do not fit, as `rasterize` does.
+    Raises ValueError or TypeError if arguments do not fit, as `rasterize` does.
     """
     return visible_radii(means3D, as_ours(self.raster_settings, {})[0], scales, rotations, cov3D_precomp)
 
@@ -233,7 +233,7 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
     """Returns GaussianRasterizationSettings, GaussianRasterizer and rasterize_gaussians of a contract.
 
     module: the module that the classes belong to. renderer: from the settings and the arguments by name to the results,
-    where `results_of` does not do.
+    if `results_of` does not do.
     """
     entry = contract_of(contract)
     new_settings = [name for name in entry.settings if name not in Settings._fields]

@@ -10,7 +10,7 @@ from scenes import REMOVABLE_MODES, gradients, op_arguments, op_results, random_
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
-# torch.compile of 2.4.1 breaks the graph where the package looks at its arguments; 2.11 and 2.15 do not.
+# torch.compile of 2.4.1 breaks the graph when the package looks at its arguments; 2.11 and 2.15 do not.
 WHOLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)
 NUM_IMAGES = 2 + len(OUTPUTS)  # results of the op that are the caller's: color and radii too
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import diff_smoe_rasterization
 
 HERE = Path(__file__).resolve().parent
-PACKAGE_PARENT = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # where it is installed, or the tree
+PACKAGE_PARENT = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # its installation, or the tree
 PACKAGES = HERE / "packages"  # what trainers import beside the rasterizer
 
 

@@ -1,4 +1,4 @@
-"""Rows that are drawn by weights, also where torch.multinomial takes no more rows."""
+"""Rows that are drawn by weights, also if torch.multinomial takes no more rows."""
 from __future__ import annotations
 
 import math
