@@ -5,6 +5,8 @@ line imports no function before it is called: torch takes seconds.
 """
 from __future__ import annotations
 
+DEVICES = ("auto", "cpu", "cuda")  # a run knows the last two
+
 MATCHING = ("auto", "exhaustive", "sequential")  # of photographs; the first is the default
 CAMERA_MODELS = ("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # COLMAP's names
 CAMERA_MODEL = "OPENCV"

@@ -11,7 +11,7 @@ from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
-from ..model import SH_C0
+from ..scenes.pointcloud import SH_C0
 from .rows import rotatable_rows, sigmoid, y_up
 
 SPLATTING = "KHR_gaussian_splatting"

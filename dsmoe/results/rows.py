@@ -7,7 +7,7 @@ from typing import Any, Dict, List, Optional, Union
 
 from diff_smoe_rasterization.settings import GATED_MODES
 
-from ..config import LEARNED, TrainConfig
+from ..config import LEARNED, TrainConfig, learned_gate_of
 from ..errors import TrainerError
 from ..importance_options import importance_settings
 from ..scenes.images import DOWNSCALER
@@ -32,8 +32,9 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     unusual: Dict[str, Any] = {}
     if config.background_gate == LEARNED:
         unusual.update(background_gate_learned=True, background_gate_bound=config.background_gate_bound)
-        for name, value in (("background_gate_start", 1.0), ("background_gate_lr", 0.01)):
-            if getattr(config, name) != value:
+        usual = learned_gate_of("smoe_eq7")
+        for name in ("background_gate_start", "background_gate_lr"):
+            if getattr(config, name) != usual[name]:
                 unusual[name] = getattr(config, name)
     if config.batch > 1:
         unusual["batch"] = config.batch

@@ -16,14 +16,13 @@ from diff_smoe_rasterization import io
 
 from ..config import TrainConfig
 from ..errors import SceneError, said_of
-from ..model import SH_C0
 from ..system.files import is_file
 from .cameras import LARGEST, Camera
 from .images import image_size
 from .layout import Layout, PosedImage, hold_out
 from .lens import Lens, lens_of
 from .orbit import orbit_of_cameras
-from .pointcloud import PointCloud
+from .pointcloud import SH_C0, PointCloud
 
 TRANSFORMS = "transforms.json"
 RANDOM_POINTS = 100_000  # as 3DGS

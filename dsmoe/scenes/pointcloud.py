@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import SceneError
 
+SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi)): a colour is 1/2 + SH_C0 dc
 MIN_POINTS = 4  # each scale is the distance to three neighbours
 
 

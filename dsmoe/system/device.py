@@ -6,7 +6,7 @@ from typing import Optional
 
 import torch
 
-from ..config import DEVICES
+from ..choices import DEVICES
 from ..errors import TrainerError
 from .environment import extension_info, machine
 

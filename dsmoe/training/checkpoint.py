@@ -13,7 +13,7 @@ from ..config import CHECKPOINT_NAME, TrainConfig
 from ..errors import TrainerError, out_of_memory
 from ..model import GaussianModel
 from ..system.files import write_atomically
-from .background_gate import LearnedGate
+from .gate import LearnedGate
 from .state_check import Misfit, check_model, check_numbers
 
 TENSOR = "__tensor__"  # stands for a tensor
@@ -52,7 +52,7 @@ def made_so_far(config: TrainConfig, device: str) -> SoFar:
         elif state["gate"] is None:
             gate = float(config.background_gate)
         else:
-            learned = LearnedGate(config, device)
+            learned = LearnedGate(config.gate, config.batch, device)
             learned.load_state_dict(state["gate"])
             gate = float(learned.value)
         return SoFar(path, model, gate, int(state["iteration"]), float(state["train_seconds"]))

@@ -25,7 +25,7 @@ from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer, package_rasterizer
 from ..scenes.cameras import Camera
 from ..scenes.images import View
-from .background_gate import LearnedGate
+from .gate import LearnedGate
 from .graphs import Captured, Graphs, NoGraphs
 from .strategy import Look, Step, ViewStep, look_at
 

@@ -18,7 +18,7 @@ from ..scenes.images import View
 from ..scenes.scene import Scene, difference_of, scene_fingerprint
 from ..system.group import ALONE
 from ..system.stopwatch import Stopwatch
-from .background_gate import LearnedGate
+from .gate import LearnedGate
 from .graphs import CudaGraphs
 from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses, Passes, ViewOver
@@ -44,7 +44,7 @@ class Trainer:
         self.shards = self._make_shards()
         background = background_color(config.white_background, config.device)
         learned = config.background_gate == LEARNED
-        self.gate = LearnedGate(config, config.device) if learned else None
+        self.gate = LearnedGate(config.gate, config.batch, config.device) if learned else None
         self.renderer = Renderer(
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),
