@@ -15,7 +15,7 @@ import torch
 from ..errors import ConfigError
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
-from .drawing import draw
+from .randomness import draw
 from .strategy import Look, SteadyStrategy, Step, StrategyContext, is_due
 
 # Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, sixteen removals are at 8,200 to 13,825,

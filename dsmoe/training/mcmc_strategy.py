@@ -12,7 +12,7 @@ import torch
 from diff_smoe_rasterization.gaussians import divided
 
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
-from .drawing import draw
+from .randomness import draw
 from .strategy import Step, Strategy, StrategyContext
 
 DEAD_OPACITY = 0.005  # fainter Gaussians are relocated

@@ -20,9 +20,8 @@ from ..system.group import ALONE
 from ..system.stopwatch import Stopwatch
 from .gate import LearnedGate
 from .graphs import CudaGraphs
-from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses, Passes, ViewOver
-from .randomness import random_state, restore_random_state, seed_everything
+from .randomness import ViewOrder, random_state, restore_random_state, seed_everything
 from .shards import Shards
 from .state_check import check_state
 from .strategies import STRATEGIES

@@ -8,9 +8,8 @@ import subprocess
 import sys
 
 import pytest
-from checkouts import PACKAGE_PARENT, contents, environment
+from checkouts import GR, PACKAGE_PARENT, RENDERER, contents, environment, make, refused
 from packaged import ROOT, packages_and_data
-from tiny import GR, RENDERER, make, refused
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES
 from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES
