@@ -1,8 +1,8 @@
 """Builds libdsmoe.so, the torch ops and the extension _core by CMake: csrc/python/CMakeLists.txt.
 
-Metadata: pyproject.toml. Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA; unset:
-where also a GPU is seen, or cards are named), TORCH_CUDA_ARCH_LIST, MAX_JOBS; DSMOE_CUDA_ARCH=all compiles for every
-card where none is seen; DSMOE_CORE_FOLDER=DIR links the libraries that CMake has built in DIR (libdsmoe_core.a,
+Metadata: pyproject.toml. Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: if torch and the machine have CUDA; unset:
+if also a GPU is seen, or cards are named), TORCH_CUDA_ARCH_LIST, MAX_JOBS; DSMOE_CUDA_ARCH=all compiles for every
+card if none is seen; DSMOE_CORE_FOLDER=DIR links the libraries that CMake has built in DIR (libdsmoe_core.a,
 libdsmoe_io.a, libdsmoe_cuda.a) in place of compiling their sources once more; DSMOE_STABLE_ABI=1 makes the ops by
 LibTorch's stable ABI: they load with every PyTorch from 2.11 on; then DSMOE_PYTHONS="python3.10 python3.12" builds
 _core for these Pythons too, and a wheel is for all of them.
@@ -21,7 +21,7 @@ from setuptools.command.build_ext import build_ext
 
 ROOT = Path(__file__).resolve().parent
 PACKAGE = "diff_smoe_rasterization"
-# What is compiled for where no card is seen. A kernel runs on later cards of the same major number too; cards after the
+# What is compiled for if no card is seen. A kernel runs on later cards of the same major number too; cards after the
 # last compile its PTX when they first run it. EVERY_CARD: what torch's own builds are for, and 11.0. The usual ones are
 # the oldest that the toolkit knows, for its major number, and these.
 EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
@@ -83,7 +83,7 @@ def answer(*command):
 
 
 def reasons_against_cuda(torch, cuda_home):
-    """Returns why the CUDA backend is not built, as a list; empty where it is."""
+    """Returns why the CUDA backend is not built, as a list; empty if it is."""
     wish = os.environ.get("DSMOE_BUILD_CUDA", "")
     if wish not in ("", "auto", "0", "1"):
         sys.exit(f"DSMOE_BUILD_CUDA is {wish!r}; it must be auto, 0 or 1")
@@ -119,7 +119,7 @@ def seconds_of(sources):
 
 
 def announcement(sources, without_cuda):
-    """What is compiled, and about how long that takes at most: where some of it has been compiled before, less."""
+    """What is compiled, and about how long that takes at most: if some of it has been compiled before, less."""
     seconds = sum(seconds_of(sources)) / jobs()
     why = "; ".join(without_cuda)
     target = "for the CPU" if why else "for CPU and GPU"
@@ -128,7 +128,7 @@ def announcement(sources, without_cuda):
 
 
 def tell(text):
-    """Prints a line, and shows it on the terminal where pip keeps what a build prints."""
+    """Prints a line, and shows it on the terminal if pip keeps what a build prints."""
     print(text, flush=True)
     if not sys.stdout.isatty():
         try:
@@ -139,9 +139,9 @@ def tell(text):
 
 
 def architecture_flags(nvcc, torch):
-    """Returns nvcc's flags where no card is seen, as torch has no default there: DSMOE_CUDA_ARCH=usual or all, and PTX.
+    """Returns nvcc's flags if no card is seen, as torch has no default there: DSMOE_CUDA_ARCH=usual or all, and PTX.
 
-    Empty where TORCH_CUDA_ARCH_LIST says for which cards, or where torch sees some: it compiles for those.
+    Empty if TORCH_CUDA_ARCH_LIST says for which cards, or if torch sees some: it compiles for those.
     """
     if os.environ.get("TORCH_CUDA_ARCH_LIST") or torch.cuda.device_count() > 0:
         return []
@@ -160,7 +160,7 @@ def architecture_flags(nvcc, torch):
 
 
 def pybind11_folder(torch):
-    """Returns the folder of pybind11's headers: those of the package, or where it is not installed PyTorch's copy."""
+    """Returns the folder of pybind11's headers: those of the package, or if it is not installed PyTorch's copy."""
     try:
         import pybind11
     except ImportError:
@@ -292,7 +292,7 @@ def any_python():
 
 
 def commit():
-    """The commit of the source folder, "+" behind it where tracked files were changed; None where git does not say."""
+    """The commit of the source folder, "+" behind it if tracked files were changed; None if git does not say."""
     def git(*words):
         return subprocess.run(["git", "-C", str(ROOT), *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
                               check=True).stdout.decode().strip()

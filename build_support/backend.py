@@ -2,7 +2,7 @@
 
 The extension only loads with the torch release that it was built against. An isolated build hides the
 caller's torch, so it would get the newest one from the index and the extension would not load later.
-Hence the caller's torch is put back in sight; only where there is none is one asked for.
+Hence the caller's torch is put back in sight; only if there is none is one asked for.
 """
 import importlib.util
 import site

@@ -5,7 +5,7 @@
 as with Inria's rasterizer of 2023; `blend_mode` in the settings is the one addition. `rasterize` is the full function.
 
 A module is imported when one of its names is first used: importing torch takes seconds, and `settings` and the help of
-`dsmoe` need none of it. Only where torch is loaded already, all names are imported at once, which registers the ops.
+`dsmoe` need none of it. Only if torch is loaded already, all names are imported at once, which registers the ops.
 """
 import importlib
 import sys

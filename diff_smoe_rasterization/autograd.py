@@ -46,7 +46,7 @@ def _is_transformed():
 
 
 def refuse_transforms(function, values):
-    """Raises NotImplementedError where torch.func or forward mode differentiates, or maps, a tensor among the values.
+    """Raises NotImplementedError if torch.func or forward mode differentiates, or maps, a tensor among the values.
 
     The ops would drop a tangent, and autograd.Function with a context does not know torch.func.
     """
@@ -79,7 +79,7 @@ class _FirstDerivatives(torch.autograd.Function):
 
 
 def differentiated_once(function, gradients, sources):
-    """Returns gradients, tensors or None, that raise where they are differentiated again by one of the sources."""
+    """Returns gradients, tensors or None, that raise if they are differentiated again by one of the sources."""
     marked = iter(_FirstDerivatives.apply(function, [each for each in gradients if each is not None], *sources))
     return tuple(None if gradient is None else next(marked) for gradient in gradients)
 
@@ -123,7 +123,7 @@ def _keep(ctx, inputs, output):
 
 
 def _input_gradients(ctx, wanted, gradients, inputs, images, saved, op):
-    """Returns a gradient for each input, None where it is not wanted."""
+    """Returns a gradient for each input, None if it is not wanted."""
     image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
     refuse_transforms("rasterize", [*image_gradients, *inputs])
     results = iter(op(*image_gradients, inputs, ctx.present, images, saved, *ctx.options, wanted))
@@ -150,8 +150,8 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx, options, *inputs):
         with _below_autograd():
             *images, saved = _OPS.rasterize.default(*inputs, *options)
-        # The backward pass reads the images where a pixel is divided by its gate sum. An expected depth always is. The
-        # caller may edit the images, so they are copied; where they are not read, they are not.
+        # The backward pass reads the images if a pixel is divided by its gate sum. An expected depth always is. The
+        # caller may edit the images, so they are copied; if they are not read, they are not.
         read = _DIVIDES[options[_BLEND_MODE]] or images[_DEPTH].numel() > 0
         ctx.images = [image.clone() if read and image.numel() > 0 else image.detach()
                       for i, image in enumerate(images) if i != _RADII]
@@ -247,9 +247,8 @@ def _fake_importance(pixel_weights, share_weights, color, gate_sum, bg, radii, *
     return tuple(pixel_weights.new_empty(radii.shape) for _ in range(3))
 
 
-def _fake_gate_map(radii, saved, background_gate, *options):
-    given = dict(zip(OPTIONS, options))
-    return tuple(radii.new_empty((given["image_height"], given["image_width"])) for _ in range(2))
+def _fake_gate_map(gate_sum, radii, *others):
+    return tuple(radii.new_empty(gate_sum.shape[1:]) for _ in range(3))
 
 
 def _on_one_device(name, fake):

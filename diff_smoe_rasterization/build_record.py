@@ -1,4 +1,4 @@
-"""What the build wrote down, and the error where what it made does not load."""
+"""What the build wrote down, and the error if what it made does not load."""
 from __future__ import annotations
 
 import importlib
@@ -8,7 +8,7 @@ BUILD = "in the source folder type: pip install --no-build-isolation -e ."
 
 
 def recorded(name: str) -> Optional[str]:
-    """Returns what the build wrote down under this name, readable even where the extension cannot be loaded."""
+    """Returns what the build wrote down under this name, readable even if the extension cannot be loaded."""
     try:
         return getattr(importlib.import_module("._build_info", __package__), name, None)
     except ImportError:

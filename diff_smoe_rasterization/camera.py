@@ -19,7 +19,7 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
 
     Args:
         K: [3, 3] intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. As in COLMAP, the centre of the top left
-            pixel is (0.5, 0.5); where it is (0, 0), as in OpenCV, add 0.5 to cx and cy.
+            pixel is (0.5, 0.5); if it is (0, 0), as in OpenCV, add 0.5 to cx and cy.
         R, t: [3, 3] and [3], world to view: x_view = R x_world + t, with x right, y down, z forward.
         width, height: of the image in pixels.
         bg: [C] background colour; black where it is None. The matrices are on its device.
@@ -27,10 +27,10 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
         options: further fields of the settings, such as blend_mode.
     K, R and t are tensors, arrays or lists. The matrices have gradients with respect to R, t and, in the projection, K.
 
-    Returns: GaussianRasterizationSettings. Raises ValueError where a shape does not fit, K has skew or focal lengths
+    Returns: GaussianRasterizationSettings. Raises ValueError if a shape does not fit, K has skew or focal lengths
     that are not positive, R is no rotation, or a blend mode is not known.
     """
-    resolve_blend_mode(options.get("blend_mode"))  # refused where it is given, not at the first rendering
+    resolve_blend_mode(options.get("blend_mode"))  # refused if it is given, not at the first rendering
     dtype = dtype or (torch.float32 if bg is None else bg.dtype)
     bg = torch.zeros(3, dtype=dtype) if bg is None else bg
     device = R.device if isinstance(R, torch.Tensor) else "cpu"  # computed there: elsewhere to check values would wait

@@ -8,7 +8,7 @@ import torch
 
 
 def check_tensor(function: str, name: str, value: Any) -> None:
-    """Raises TypeError where a named argument of a function is no dense tensor."""
+    """Raises TypeError if a named argument of a function is no dense tensor."""
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
     if value.layout is not torch.strided:
@@ -16,7 +16,7 @@ def check_tensor(function: str, name: str, value: Any) -> None:
 
 
 def check_tensors(function: str, **values: Any) -> None:
-    """Raises TypeError where one of the named arguments of a function is no dense tensor, or on another device."""
+    """Raises TypeError if one of the named arguments of a function is no dense tensor, or on another device."""
     first_name, device = "", None
     for name, value in values.items():
         check_tensor(function, name, value)
@@ -27,7 +27,7 @@ def check_tensors(function: str, **values: Any) -> None:
 
 
 def checked_number(function: str, name: str, value: Any) -> float:
-    """The value of a named argument, a number or a tensor [], as a float. Raises TypeError where it is neither."""
+    """The value of a named argument, a number or a tensor [], as a float. Raises TypeError if it is neither."""
     is_scalar = isinstance(value, torch.Tensor) and value.dim() == 0 and not value.is_complex()
     if not is_scalar and not isinstance(value, numbers.Real):
         raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a number")

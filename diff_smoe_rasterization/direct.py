@@ -90,7 +90,7 @@ class DirectRendering:
 
         dL_dimages: by name, `color` and OUTPUTS. gradients: for the arguments whose gradients are wanted, by name, also
         bg and background_gate; dense and of their shape. Of those with a row for each Gaussian only the rows are
-        written whose radius is above 0. The others stay as they are. Raises RuntimeError before `render`, and where an
+        written whose radius is above 0. The others stay as they are. Raises RuntimeError before `render`, and if an
         argument or an image was changed in place since.
         """
         images = self._rendered("backward")
@@ -120,5 +120,5 @@ class DirectRendering:
 
 
 def _version(tensor: Optional[torch.Tensor]) -> int:
-    """How often a tensor was changed in place; 0 where torch does not count, as of inference tensors."""
+    """How often a tensor was changed in place; 0 if torch does not count, as of inference tensors."""
     return 0 if tensor is None or tensor.is_inference() else tensor._version

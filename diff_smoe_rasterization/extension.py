@@ -63,7 +63,7 @@ def build_info() -> Dict[str, Any]:
     """Returns what this build is and what it runs on.
 
     Keys: version, torch (running), torch_built_with, stable_abi_since (the oldest torch that this build works with;
-    None where torch_built_with is the only one), compiler, cuda_built, without_cuda_because (None where it is built or
+    None if torch_built_with is the only one), compiler, cuda_built, without_cuda_because (None if it is built or
     the build left no word), simd_level ("avx512", "avx2" or "baseline"), num_threads (torch's, which the CPU backend
     uses).
     """

@@ -132,13 +132,13 @@ def _wants_gradient(tensors: Sequence[Optional[torch.Tensor]]) -> bool:
 
 
 def _spread(tensors: Sequence[torch.Tensor], present: Sequence[bool]) -> List[Optional[torch.Tensor]]:
-    """The tensors in their places, None where none was given."""
+    """The tensors in their places, None if none was given."""
     given = iter(tensors)
     return [next(given) if here else None for here in present]
 
 
 def _reach_moves(opacities: torch.Tensor, options: Dict[str, Any], gate: Optional[torch.Tensor]) -> torch.Tensor:
-    """[N] bool: where the squared reach is 2 log(opacity / least alpha) and the least alpha is constant.
+    """[N] bool: whether the squared reach is 2 log(opacity / least alpha) and the least alpha is constant.
 
     Elsewhere the reach is constant. The rule is that of `squared_reach` and `AlphaCut` in include/dsmoe/gate.h.
     """

@@ -18,7 +18,7 @@ def activate(opacities: torch.Tensor, scales: torch.Tensor,
 
     opacities: [N, 1] logits, scales: [N, 3] logarithms, rotations: [N, 4] quaternions of any length. Returns: opacities
     sigmoid(.), scales exp(.), rotations of length 1 (a quaternion shorter than 1e-12 is divided by that).
-    Raises ValueError or TypeError where shapes, types or devices do not fit.
+    Raises ValueError or TypeError if shapes, types or devices do not fit.
     """
     check_tensors("activate", opacities=opacities, scales=scales, rotations=rotations)
     refuse_transforms("activate", (opacities, scales, rotations))
@@ -41,8 +41,8 @@ def add_view(dL_dmeans2D: torch.Tensor, radii: torch.Tensor, gradient_sum: torch
              view_count: torch.Tensor) -> None:
     """Adds one view to the statistics of densification, in place.
 
-    Where radii [N] (int32) is positive, gradient_sum [N] grows by the length of the first two components of
-    dL_dmeans2D [N, 3], and view_count [N] by 1. Raises ValueError or TypeError where shapes or types do not fit.
+    If radii [N] (int32) is positive, gradient_sum [N] grows by the length of the first two components of
+    dL_dmeans2D [N, 3], and view_count [N] by 1. Raises ValueError or TypeError if shapes or types do not fit.
     """
     check_tensors("add_view", dL_dmeans2D=dL_dmeans2D, radii=radii, gradient_sum=gradient_sum, view_count=view_count)
     _OPS.add_view(dL_dmeans2D, radii, gradient_sum, view_count)
@@ -71,7 +71,7 @@ def divided(opacities: torch.Tensor, copies: torch.Tensor,
     """Opacity and scale factor [M] of each of n equal Gaussians in one place that look as the one before.
 
     That is Equation 9 of 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv:2404.09591).
-    opacities: [M] of the one; copies: [M] n, taken as 50 where it is more. least_opacity: the scale factor follows it.
+    opacities: [M] of the one; copies: [M] n, taken as 50 if it is more. least_opacity: the scale factor follows it.
     """
     check_tensors("divided", opacities=opacities, copies=copies)
     if opacities.dim() != 1 or copies.shape != opacities.shape:

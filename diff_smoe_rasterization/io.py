@@ -1,7 +1,7 @@
 """Files of Gaussian models, point clouds and COLMAP scenes, as numpy arrays.
 
 The formats are read and written by the C++ core (csrc/io). A missing file raises FileNotFoundError (another OSError
-where it is there and cannot be read), malformed content ValueError; both name the file, ValueError also byte or line.
+if it is there and cannot be read), malformed content ValueError; both name the file, ValueError also byte or line.
 """
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Gaussians:
     opacity_logits: np.ndarray  # [N, 1]; opacity = sigmoid
     log_scales: np.ndarray  # [N, 3]; scale = exp
     rotations: np.ndarray  # [N, 4] (w, x, y, z), not normalised
-    blend_mode: Optional[str] = None  # that the model was trained with; None where the file does not say
+    blend_mode: Optional[str] = None  # that the model was trained with; None if the file does not say
     background_gate: Optional[float] = None  # lambda of `smoe` and `smoe_eq7`, from the .ply's comments
     comments: Tuple[str, ...] = ()  # comment lines of the file, those that record mode and gate included
 
@@ -49,8 +49,8 @@ class Points:
     """A cloud of N points."""
 
     positions: np.ndarray  # [N, 3] float64, world, finite
-    colors: Optional[np.ndarray] = None  # [N, 3] uint8 red, green, blue; None where there are none
-    normals: Optional[np.ndarray] = None  # [N, 3] float32; None where there are none
+    colors: Optional[np.ndarray] = None  # [N, 3] uint8 red, green, blue; None if there are none
+    normals: Optional[np.ndarray] = None  # [N, 3] float32; None if there are none
     comments: Tuple[str, ...] = ()  # comment lines of a PLY file
 
 
@@ -122,7 +122,7 @@ def write_gaussians(path: PathLike, gaussians: Gaussians) -> None:
 
 
 def read_points(path: PathLike) -> Points:
-    """Reads a .ply point cloud: x y z and, where present, red green blue (0 to 255) and nx ny nz.
+    """Reads a .ply point cloud: x y z and, if present, red green blue (0 to 255) and nx ny nz.
 
     Raises OSError; ValueError for malformed content and for a position that is NaN or infinite.
     """
@@ -161,9 +161,9 @@ def read_colmap_cameras(path: PathLike) -> Dict[int, ColmapCamera]:
 
 
 def write_colmap(folder: PathLike, model: ColmapModel, text: bool = False) -> None:
-    """Writes cameras, images and points3D (.bin, or .txt where `text`) into folder, which is made where it is missing.
+    """Writes cameras, images and points3D (.bin, or .txt if `text`) into folder, which is made if it is missing.
 
-    Points get black where there are no colours, and COLMAP's -1 where there are no errors. Normals are not stored.
+    Points get black if there are no colours, and COLMAP's -1 if there are no errors. Normals are not stored.
     Raises OSError; ValueError naming what cannot be written.
     """
     cameras = [

@@ -30,11 +30,11 @@ class LazyAdam:
         lazy.step(radii)        # the step is made on these rows when they are next caught up
 
     The parameters, and their moments in the FusedAdam, are up to date after `catch_up()`. They may be changed then, in
-    place or by load_state_dict, and so may betas and eps; where a parameter gets another number of rows, make a new
+    place or by load_state_dict, and so may betas and eps; if a parameter gets another number of rows, make a new
     LazyAdam. Learning rates may change between steps.
 
-    Both functions raise RuntimeError where something else than a learning rate has changed while steps waited, and
-    ValueError where the groups do not fit, as the constructor does.
+    Both functions raise RuntimeError if something else than a learning rate has changed while steps waited, and
+    ValueError if the groups do not fit, as the constructor does.
     """
 
     def __init__(self, adam: FusedAdam, parameters: Sequence[torch.Tensor]) -> None:
@@ -52,7 +52,7 @@ class LazyAdam:
         self._left_ages: List[int] = []
         self._look_up()
         self.gradients = [torch.empty_like(parameter, requires_grad=False) for parameter in self.parameters]
-        """Where the gradients of the rows that are seen go; a row keeps its gradient until it is caught up."""
+        """The memory for the gradients of rows that are seen; a row keeps its gradient until it is caught up."""
         rows = len(self.parameters[0])
         self._marks = torch.zeros(rows, dtype=torch.int32, device=self.parameters[0].device)
         self._rates = self.parameters[0].new_zeros(_CAPACITY, len(self.parameters), 2)
@@ -95,7 +95,7 @@ class LazyAdam:
 
     @torch.no_grad()
     def catch_up(self, radii: Optional[torch.Tensor] = None) -> None:
-        """Brings rows up to date: all, or those where radii [N] (int32) is above 0."""
+        """Brings rows up to date: all, or those whose radii [N] (int32) are above 0."""
         if radii is not None:
             check_tensors("LazyAdam.catch_up", radii=radii)
         if self._steps == 0:
@@ -109,11 +109,11 @@ class LazyAdam:
 
     @torch.no_grad()
     def step(self, radii: torch.Tensor) -> None:
-        """Makes a step. Rows where radii [N] (int32) is above 0 are up to date, and `gradients` has theirs."""
+        """Makes a step. Rows whose radii [N] (int32) are above 0 are up to date, and `gradients` has theirs."""
         check_tensors("LazyAdam.step", radii=radii)
         age, rates = self._next_step()
         _OPS.lazy_adam_step(self._marks, self._rates, self._steps, *map(list, zip(*rates)), radii)
-        self._count_step(age)  # behind the op: where it refuses radii no step is counted
+        self._count_step(age)  # behind the op: if it refuses radii no step is counted
         self.end()
 
     # The same in two parts: the host's, and the launches', which read their numbers in memory of the device. So a loop

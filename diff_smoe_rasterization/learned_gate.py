@@ -1,7 +1,7 @@
 """The background's gate lambda as a parameter of this process, which a trainer that cannot be edited learns.
 
 `background_gate="learned"` in the settings of a rendering takes it. The gate steps with the optimizer that holds the
-centres of the Gaussians; where none holds them, as they are computed, with the first that steps after a backward pass.
+centres of the Gaussians; if none holds them, as they are computed, with the first that steps after a backward pass.
 Of an optimizer that is none of torch's it learns at the next rendering, by the centres that have changed in place.
 """
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ProcessGate:
         self._found: Optional[float] = None  # what a file said of it, until it is stepped
         self._adam: Dict[str, Any] = {}
         self._learns = False  # whether a rendering had its gradient
-        self._centres: Any = None  # a weak reference to those of the last one, where they are a parameter
+        self._centres: Any = None  # a weak reference to those of the last one, if they are a parameter
         self._version = 0  # of their values then
         self._holder: Any = None  # likewise to the optimizer that holds them
         self._passed: Any = None  # likewise to an optimizer that stepped while the gate waited for its own
@@ -82,7 +82,7 @@ class ProcessGate:
         return not self.frozen or self._found is not None
 
     def value(self) -> float:
-        """Returns lambda; on a GPU the host waits for it. Raises RuntimeError where a trained model has not said it."""
+        """Returns lambda; on a GPU the host waits for it. Raises RuntimeError if a trained model has not said it."""
         if self._found is not None:
             return self._found
         if self.frozen:
@@ -108,7 +108,7 @@ class ProcessGate:
 
     def of_rendering(self, blend_mode: str, tensors: Sequence[torch.Tensor], means3D: Optional[torch.Tensor]
                      ) -> Union[float, torch.Tensor]:
-        """Returns the lambda of a rendering. It has a gradient where one of the tensors has one.
+        """Returns the lambda of a rendering. It has a gradient if one of the tensors has one.
 
         tensors: of the Gaussians; lambda has the type and device of the first. means3D: their centres, if known.
         """
@@ -140,8 +140,8 @@ class ProcessGate:
     def _watch(self, means3D: torch.Tensor) -> None:
         """Notes whose step the gate waits for.
 
-        A gradient may wait that no optimizer of torch took. Where the centres were changed in place, and none of torch
-        is known to hold them, an optimizer of another kind has stepped. Where their gradient is gone or all 0, or they
+        A gradient may wait that no optimizer of torch took. If the centres were changed in place, and none of torch
+        is known to hold them, an optimizer of another kind has stepped. If their gradient is gone or all 0, or they
         are gone, the trainer dropped it.
         """
         if not means3D.is_leaf or not means3D.requires_grad:
@@ -168,7 +168,7 @@ class ProcessGate:
         if optimizer is not holder and centres is not None and any(
                 one is centres for group in optimizer.param_groups for one in group["params"]):
             holder, self._holder = optimizer, weakref.ref(optimizer)
-        # Densification may have replaced the centres by others before the step. Where their optimizer is not known, one
+        # Densification may have replaced the centres by others before the step. If their optimizer is not known, one
         # that steps a second time is as good.
         if self._centres is None or optimizer is holder or (
                 holder is None and self._passed is not None and self._passed() is optimizer):

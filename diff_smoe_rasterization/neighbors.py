@@ -11,7 +11,7 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
 
     points: [N, 3], float32 or float64, on a GPU or on the CPU. Fewer than four points: the mean over those there are,
     0 for a single one. Coinciding points are at distance 0. Returns: [N] of the same type. Exact but for rounding.
-    Raises ValueError where the shape does not fit or a coordinate is not finite, TypeError for another type.
+    Raises ValueError if the shape does not fit or a coordinate is not finite, TypeError for another type.
     """
     check_tensors("distCUDA2", points=points)
     from .extension import BACKENDS  # noqa: F401  (loading it registers the op)

@@ -16,7 +16,7 @@ class FusedAdam(torch.optim.Adam):
     """Adam as torch.optim.Adam computes it, but for rounding: one kernel launch a step for each precision and device.
 
     Groups and state are torch.optim.Adam's but for state["step"], an int here. Each takes the state_dict() of the
-    other. Where a group asks for weight_decay, amsgrad or maximize, or a gradient is sparse or neither float32 nor
+    other. If a group asks for weight_decay, amsgrad or maximize, or a gradient is sparse or neither float32 nor
     float64, the step is torch.optim.Adam's own.
     """
 
@@ -78,7 +78,7 @@ class SparseGaussianAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, visibility: torch.Tensor, N: int) -> None:  # type: ignore[override]
-        """Steps the rows where visibility [N] (bool) is set, of every parameter that has a gradient."""
+        """Steps the rows whose visibility [N] (bool) is set, of every parameter that has a gradient."""
         check_tensors("SparseGaussianAdam.step", visibility=visibility)
         if visibility.numel() != checked_number("SparseGaussianAdam.step", "N", N):
             raise ValueError(f"SparseGaussianAdam.step: visibility has shape {list(visibility.shape)}; "

@@ -27,7 +27,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         means2D: [N, 3]; only its gradient is used: dL/d(pixel) times (width / 2, height / 2), z = 0.
             Densification reads it.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.
-        dc: [N, 1, 3], the first coefficient where shs [N, K - 1, 3] holds only the others.
+        dc: [N, 1, 3], the first coefficient if shs [N, K - 1, 3] holds only the others.
         colors_precomp: [N, C] instead of shs; C is free and settings.bg has as many.
         scales, rotations: [N, 3] standard deviations, world, and [N, 4] quaternions (w, x, y, z), used as given.
         cov3D_precomp: [N, 6] (xx, xy, xz, yy, yz, zz) instead of scales and rotations.
@@ -35,7 +35,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         means2D_abs: [N, 2]; only its gradient is used: the sum over pixels of the absolute values of
             dL/d(pixel), each axis apart, times (width / 2, height / 2). Without it nothing is summed.
     All tensors have one type, float32 or float64, and one device. Absent is None, or any tensor without elements;
-    where N is 0, None or one of shape [0].
+    if N is 0, None or one of shape [0].
 
     Returns: Rendering. A Gaussian with a NaN or infinite attribute, or an opacity above 1e20, is culled: radius 0,
     gradients 0.

@@ -8,17 +8,17 @@ Rendering". Read it in this order: `rasterize`, `project`, `pair_counts`, `wide_
 What the paper leaves open is decided here:
 
 - Gaussians are sorted by view depth; equal depths keep the order of the input.
-- A Gaussian is culled (radius 0, gradients exactly 0) where any value of its attributes, used or not, is NaN or
+- A Gaussian is culled (radius 0, gradients exactly 0) if any value of its attributes, used or not, is NaN or
   infinite, its opacity is above 1e20, its view depth is not beyond `near`, its projected covariance is not positive
   definite, its pixel position, conic or colour is not finite, or its footprint misses the image.
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `tail_sum`.
-- Where the near pairs of a pixel cover it, `smoe` blends no others, and `smoe_eq7` on request: see `wide_pixels`.
+- If the near pairs of a pixel cover it, `smoe` blends no others, and `smoe_eq7` on request: see `wide_pixels`.
 - The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
 - In `smoe_eq7` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a
-  tensor of value 1 keeps the footprints. Where the background has a gate, opacity cuts pairs too: see `pair_counts`.
+  tensor of value 1 keeps the footprints. If the background has a gate, opacity cuts pairs too: see `pair_counts`.
 - The value of `means2D` is ignored; it only receives a gradient.
 """
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _float32(value):
 
 
 COMPENSATION_MIN = _float32(2.5e-5)  # least square of the antialiasing factor (3DGS of 2024)
-FRUSTUM_MARGIN = 1.3  # the Jacobian is taken at most this many tan(fov) off axis, where it still fits (3DGS)
+FRUSTUM_MARGIN = 1.3  # the Jacobian is taken at most this many tan(fov) off axis, if it still fits (3DGS)
 W_EPSILON = 1e-7  # added to the clip w before dividing (3DGS)
 EIGENVALUE_SPREAD_MIN = _float32(0.1)  # px^4 under the root of the radius rule (3DGS)
 TILE = 16  # px; the tiles of 3DGS, whose rectangle is part of its image
@@ -56,7 +56,7 @@ ALPHA_MIN = _float32(1 / 255)  # less changes no 8-bit image (3DGS)
 STRONG_MIN = _float32(1 / 2040)  # `smoe`: pairs of at least this alpha are blended; weaker ones are tails (authors)
 CORE_MIN = _float32(1 / 1020)  # `smoe`: within 3 sigma, pairs of less alpha are faint
 TAIL_MIN = _float32(1 / 2040 / 255)  # `smoe`: weaker tails change no 8-bit image, as STRONG_MIN is the least sum there
-EVERY_TAIL_MIN = 2.0**-35  # the same where all pixels have all pairs: half a float32 unit of STRONG_MIN
+EVERY_TAIL_MIN = 2.0**-35  # the same if all pixels have all pairs: half a float32 unit of STRONG_MIN
 KERNEL_MIN = _float32(1e-5)  # other SMoE modes cut on G: faint pairs decide where gates are weak (paper's text)
 KERNEL_KEPT = _float32(math.exp(-4.5))  # G at 3 sigma: nearer, a background gate cuts nothing, or gradients would end
 TRANSMITTANCE_MIN = _float32(1e-4)  # a pixel this dark behind what it has is finished (3DGS)
@@ -405,8 +405,8 @@ class _PassThroughClamp(torch.autograd.Function):
 def pair_counts(splats, x, y, settings, mode, gate):
     """Returns which pairs of Gaussian and pixel count [n, pixels]; x, y [pixels] are pixel coordinates.
 
-    A pair counts where o > 0, power <= 0 and, in "alpha", alpha >= 1/255 within the tile rectangle of 3DGS; in "smoe"
-    alpha >= 1/2040 (or alpha_min) within that rectangle; in the other modes G >= 1e-5 and alpha >= alpha_min. Where
+    A pair counts if o > 0, power <= 0 and, in "alpha", alpha >= 1/255 within the tile rectangle of 3DGS; in "smoe"
+    alpha >= 1/2040 (or alpha_min) within that rectangle; in the other modes G >= 1e-5 and alpha >= alpha_min. If
     the background has a gate lambda > 0 there, a pair of less than lambda / 255 changes no 8-bit image either, and
     counts only within 3 sigma, whatever the Gaussian's opacity.
     """
@@ -462,7 +462,7 @@ def blended_pairs(splats, x, y, settings, mode, gate):
 
 
 def tail_sum(splats, x, y, counts, alpha, settings, mode, wide):
-    """Returns the sum B of each pixel's tails [pixels]; 0 in modes but "smoe", and where it is not wide. No gradient.
+    """Returns the sum B of each pixel's tails [pixels]; 0 in modes but "smoe", and if it is not wide. No gradient.
 
     A tail is a pair within the tile rectangle that is too weak to count. Its alpha T joins B while its pixel is open,
     and T does not feel it. counts, alpha: [n, pixels], of `blended_pairs` and `pair_alphas`. wide: [pixels].
@@ -538,7 +538,7 @@ def blend(alpha, color, depth, bg, mode, gate, tails):
 
 
 def _quotient(numerator, gates, without, otherwise):
-    """Returns numerator / gates, and what is to stand where there are no gates."""
+    """Returns numerator / gates, and what is to stand if there are no gates."""
     return torch.where(without, torch.as_tensor(otherwise).to(gates), numerator / gates.masked_fill(without, 1))
 
 

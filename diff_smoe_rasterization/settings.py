@@ -17,15 +17,15 @@ name       paper                  colour of a pixel                           ba
 alpha      Eq. 3 (3DGS)           sum c_i alpha_i T_i + T bg                  blended
 smoe       the authors' program   (sum c_i alpha_i T_i + B bg) / (W + B)      by tails and gate
 smoe_eq7   Eq. 7 (the text)       sum c_i alpha_i T_i / W                     by its gate
-smoe_tn    Eq. 8 (ablation)       sum c_i alpha_i T_i / sum alpha_i           where no gate
-smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               where no gate
+smoe_tn    Eq. 8 (ablation)       sum c_i alpha_i T_i / sum alpha_i           if no gate
+smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               if no gate
 ========== ====================== =========================================== ==========
 
 W = sum alpha_i T_i. In `smoe` the sums are of strong pairs, those of alpha >= 1/2040. A weaker pair in the tiles of its
 Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. `smoe_eq7` sums all pairs
 of G >= 1e-5.
 
-A pair that counts is near where alpha >= 1/255, and within 3 sigma where alpha >= 1/1020; else it is faint. Where the
+A pair that counts is near if alpha >= 1/255, and within 3 sigma if alpha >= 1/1020; else it is faint. If the
 near pairs of a pixel have a gate sum of `faint_below` or more, only they are blended, and B is 0. That is 0.25 in
 `smoe`, and in `smoe_eq7` on request.
 
@@ -44,7 +44,7 @@ GATED_MODES = tuple(mode for mode, gate in _FIXED_GATES.items() if gate is None)
 """The blend modes that take a `background_gate`: `smoe` and `smoe_eq7`."""
 
 _FAINT_BELOW = {"smoe": 0.25}
-"""The `faint_below` of a blend mode where the caller gives none; of the others it is 2: no pair is left out."""
+"""The `faint_below` of a blend mode if the caller gives none; of the others it is 2: no pair is left out."""
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
@@ -82,7 +82,7 @@ class GaussianRasterizationSettings(NamedTuple):
     near: float = 0.2  # Gaussians with view depth <= near are culled
     # SMoE modes: also skip alpha below this; 0 is the paper's rule. `smoe`: pairs below this are no strong ones
     alpha_min: float = 0.0
-    strict: bool = False  # raise where an attribute is NaN or infinite, instead of culling that Gaussian
+    strict: bool = False  # raise if an attribute is NaN or infinite, instead of culling that Gaussian
     blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
     # CUDA: gradients and sums of `Splats` equal bit for bit from run to run; slower. The CPU's always are, at one SIMD
     # level.
@@ -101,18 +101,18 @@ class Rendering(NamedTuple):
     """What `rasterize` returns; an output that was not asked for is None."""
 
     color: torch.Tensor  # [C, H, W]
-    radii: torch.Tensor  # [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
+    radii: torch.Tensor  # [N] int32; 3-sigma radius in pixels, 0 if the Gaussian touches nothing
     # [1, H, W]; the gate sum W = sum alpha_i T_i. `smoe`: W / (W + B + lambda T), what is not the background's.
     # Ablations: sum alpha_i
     alpha: Optional[torch.Tensor] = None
-    depth: Optional[torch.Tensor] = None  # [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
+    depth: Optional[torch.Tensor] = None  # [1, H, W]; expected view depth sum(w z) / sum(w), 0 if nothing is hit
     inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; 1 / z blended as a colour, over background 0
 
 
 class Contributions(NamedTuple):
     """Sums over the pixels that blended each of N Gaussians: what `Splats.contributions` returns.
 
-    A pixel is among those of a Gaussian where the Gaussian has a weight in the numerator of the pixel's colour, so none
+    A pixel is among those of a Gaussian if the Gaussian has a weight in the numerator of the pixel's colour, so none
     behind a full pixel is. A Gaussian without pixels has 0.
     """
 
@@ -140,6 +140,8 @@ class GateMap(NamedTuple):
 
     gaussians: torch.Tensor  # [H, W] int32; of the largest weight in the numerator, the nearest of equal ones; -1: none
     counts: torch.Tensor  # [H, W] int32, how many Gaussians the numerator has
+    # [H, W] int32; with it the weights, front to back (`smoe_std`: by index), reach half of their denominator; -1: none
+    medians: torch.Tensor
 
 
 FEATURE_OUTPUTS = ("depth", "inverse_depth")  # images of the op on request, in its order
@@ -151,7 +153,7 @@ def resolve_blend_mode(blend_mode: Optional[str]) -> str:
     """Returns the blend mode that a rendering uses.
 
     An explicit name wins; None means the environment variable DSMOE_BLEND_MODE, for callers that
-    cannot be edited, and "alpha" where that is unset.
+    cannot be edited, and "alpha" if that is unset.
     Raises ValueError for a name that is not in BLEND_MODES.
     """
     source = "blend_mode"
@@ -167,7 +169,7 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     """Returns the background's gate lambda that a rendering in this blend mode uses.
 
     In `smoe` and `smoe_eq7` an explicit value wins; None means the environment variable DSMOE_BACKGROUND_GATE, for
-    callers that cannot be edited, and 0 where that is unset. `alpha` has the gate 1; the ablations have none.
+    callers that cannot be edited, and 0 if that is unset. `alpha` has the gate 1; the ablations have none.
     LEARNED stays that word. Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor
     of not one element, another word, and for a value in a mode that knows none.
     """

@@ -33,7 +33,7 @@ class Splats:
 
     @property
     def centers(self) -> torch.Tensor:
-        """[N, 2] where the centres fall, x and y in pixels; the centre of the first pixel is (0, 0)."""
+        """[N, 2] the centres on the image, x and y in pixels; the centre of the first pixel is (0, 0)."""
         return self._of_visible(self._projected[:, :2])
 
     @property
@@ -47,7 +47,7 @@ class Splats:
         pixel_weights: [H, W], any numbers, of the Gaussians' type and device. On the CPU the sums are equal bit for bit
         from call to call and for any number of threads. On CUDA real numbers are added by atomics in any order, unless
         the settings had `deterministic`, and the host does not wait.
-        Raises ValueError or TypeError where pixel_weights does not fit.
+        Raises ValueError or TypeError if pixel_weights does not fit.
         """
         check_tensors("contributions", pixel_weights=pixel_weights)
         return Contributions(*_OPS.contributions(pixel_weights.detach(), self._radii, self._saved,
@@ -57,17 +57,17 @@ class Splats:
                    share_weights: Optional[torch.Tensor] = None) -> Importance:
         """What each Gaussian is worth to the image: its share of the pixels, and what its removal would change.
 
-        pixel_weights: [H, W] e, any numbers, such as a mask; None: 1. share_weights: [H, W] e of the shares, where it
+        pixel_weights: [H, W] e, any numbers, such as a mask; None: 1. share_weights: [H, W] e of the shares, if it
         is another one, such as the error of each pixel; None: pixel_weights.
-        Both are of the Gaussians' type and device. The colour image, and the alpha image where it was asked for, must
+        Both are of the Gaussians' type and device. The colour image, and the alpha image if it was asked for, must
         be as they were rendered: an image that was edited in place since gives other numbers.
 
         The removal's image is that of a rendering without the Gaussian, but for two things. Which pairs of a pixel
         count by `faint_below`, and in `smoe` the sum of its tails, stay as they are. And behind a pixel that was full
         (T < 1e-4) nothing is known. Without one of its Gaussians such a pixel may take more, of a weight below T / (1 -
-        alpha). Where nothing else is in a pixel, it shows the background's colour.
+        alpha). If nothing else is in a pixel, it shows the background's colour.
 
-        Sums are exact and reproducible as those of `contributions`. Raises ValueError or TypeError where a map does not
+        Sums are exact and reproducible as those of `contributions`. Raises ValueError or TypeError if a map does not
         fit.
         """
         if pixel_weights is None:
@@ -80,11 +80,12 @@ class Splats:
                                            *self._options))
 
     def gate_map(self) -> GateMap:
-        """Finds the Gaussian with the largest gate in each pixel; the background is no candidate.
+        """Finds the Gaussian with the largest gate in each pixel, and the median one; the background is no candidate.
 
-        The same bits from call to call. On CUDA the host does not wait.
+        The alpha image, if it was asked for, must be as it was rendered. The same bits from call to call. On CUDA the
+        host does not wait.
         """
-        return GateMap(*_OPS.gate_map(self._radii, self._saved, self._background_gate, *self._options))
+        return GateMap(*_OPS.gate_map(self._gate_sum, self._radii, self._saved, self._background_gate, *self._options))
 
     def _of_visible(self, values: torch.Tensor) -> torch.Tensor:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""

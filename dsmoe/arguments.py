@@ -10,7 +10,7 @@ from diff_smoe_rasterization.settings import BLEND_MODES
 from . import choices, fast
 from .bench.names import SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
-from .config import DEVICES, PRINCIPAL_POINTS
+from .config import PRINCIPAL_POINTS
 from .config_arguments import add_arguments
 from .patches import TRAINERS
 
@@ -175,7 +175,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--device", choices=DEVICES, default="auto",
+    parser.add_argument("--device", choices=choices.DEVICES, default="auto",
                         help="where to render; auto: $DSMOE_DEVICE, else the GPU if it can be used (default: auto)")
 
 
@@ -215,7 +215,7 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                              usage="%(prog)s SUITE [-o RESULTS] [OPTION ...]")  # --slurm would take a SUITE behind it
     run.add_argument("suite", metavar="SUITE", help=f"a .yaml file, or a shipped one: {', '.join(sorted(SHIPPED))}")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
-    run.add_argument("--device", choices=DEVICES,
+    run.add_argument("--device", choices=choices.DEVICES,
                      help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
     run.add_argument("--jobs", type=int, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "

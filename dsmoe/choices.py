@@ -1,9 +1,11 @@
-"""What commands offer, and what they take where nothing is said.
+"""What commands offer, and what they take if nothing is said.
 
 The command line shows these values, and the functions that do the work have them as defaults. Here because the command
 line imports no function before it is called: torch takes seconds.
 """
 from __future__ import annotations
+
+DEVICES = ("auto", "cpu", "cuda")  # a run knows the last two
 
 MATCHING = ("auto", "exhaustive", "sequential")  # of photographs; the first is the default
 CAMERA_MODELS = ("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # COLMAP's names

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 or 143 if interrupted."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads sleep, where they would spin
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads sleep and do not spin
     print_any_name()
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
@@ -232,7 +232,7 @@ def _eval(arguments: argparse.Namespace) -> None:
 
 
 def _with_lpips(net: str, device: str) -> Measure:
-    """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError where its weights are not there."""
+    """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError if its weights are not there."""
     from .bench.errors import BenchError
     from .bench.lpips import lpips_network
     from .bench.names import check_weights

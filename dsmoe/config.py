@@ -6,7 +6,7 @@ import glob
 import json
 import os
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Optional, Sequence, Union
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 
 from diff_smoe_rasterization.settings import (
     BACKGROUND_GATE_VARIABLE,
@@ -18,6 +18,7 @@ from diff_smoe_rasterization.settings import (
     resolve_blend_mode,
 )
 
+from .choices import DEVICES
 from .errors import ConfigError
 from .importance_options import ImportanceOptions, parse_importance_options
 from .system.files import is_file, is_folder, write_text_atomically
@@ -29,7 +30,6 @@ IMAGES = "images"  # folder of a COLMAP scene
 PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
-DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
           "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
@@ -41,10 +41,19 @@ def _option(default: Any, text: str, **extra: Any) -> Any:
     return field(default=default, metadata={"help": text, **extra})
 
 
-def _recipe(published: Any, importance: Any, text: str) -> Any:
-    """A field of the recipe that `importance` sets otherwise: None until `__post_init__` knows the strategy."""
-    return _option(None, f"{text} (default: {published}; importance: {importance})", published=published,
-                   importance=importance)
+def _varied(text: str, usual: float, **others: float) -> Any:
+    """A field that some strategies or blend modes, by name, set otherwise: None until `__post_init__` knows them."""
+    said = "; ".join([f"default: {usual:g}", *(f"{name}: {value:g}" for name, value in others.items())])
+    return _option(None, f"{text} ({said})", usual=usual, others=others)
+
+
+class GateOptions(NamedTuple):
+    """How a training comes by the background's gate."""
+
+    gate: Union[float, str]  # a number, or LEARNED: then
+    bound: float  # it stays above this
+    start: float  # and begins with this;
+    rate: float  # Adam steps the logarithm of what it has above its bound
 
 
 @dataclass
@@ -62,13 +71,10 @@ class TrainConfig:
         None, "smoe, smoe_eq7: how much the background weighs against the Gaussians: 0 is the paper's rule, 1 about "
               f"alpha blending, `{LEARNED}` finds it with the scene (default: $DSMOE_BACKGROUND_GATE, else {LEARNED})",
         metavar=f"X|{LEARNED}")
-    background_gate_bound: float = _option(
-        None, "a learned background gate stays above this (default: 0.03; smoe: 0)", kind=float)
-    background_gate_start: float = _option(
-        None, "a learned background gate starts with this (default: 1; smoe: 0.1)", kind=float)
-    background_gate_lr: float = _option(
-        None, "learning rate of the logarithm of what a learned background gate has above its bound (default: 0.01; "
-              "smoe: 0.03)", kind=float)
+    background_gate_bound: float = _varied("a learned background gate stays above this", 0.03, smoe=0.0)
+    background_gate_start: float = _varied("a learned background gate starts with this", 1.0, smoe=0.1)
+    background_gate_lr: float = _varied(
+        "learning rate of the logarithm of what a learned background gate has above its bound", 0.01, smoe=0.03)
     iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
@@ -106,13 +112,16 @@ class TrainConfig:
                "any number of GPUs; slower")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
-    position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
-    position_lr_final: float = _recipe(0.0000016, 0.0000064, "last learning rate of positions, times the scene extent")
+    position_lr_init: float = _varied(
+        "first learning rate of positions, times the scene extent", 0.00016, importance=0.00064)
+    position_lr_final: float = _varied(
+        "last learning rate of positions, times the scene extent", 0.0000016, importance=0.0000064)
     position_lr_max_steps: int = _option(30_000, "step at which the last position learning rate is reached")
-    feature_lr: float = _recipe(0.0025, 0.005, "learning rate of base colours; higher SH bands take a 20th of it, "
-                                                "with importance a tenth")
+    feature_lr: float = _varied(
+        "learning rate of base colours; higher SH bands take a 20th of it, with importance a tenth", 0.0025,
+        importance=0.005)
     opacity_lr: float = _option(0.05, "learning rate of opacity logits")
-    scaling_lr: float = _recipe(0.005, 0.01, "learning rate of log scales")
+    scaling_lr: float = _varied("learning rate of log scales", 0.005, importance=0.01)
     rotation_lr: float = _option(0.001, "learning rate of quaternions")
 
     densify_grad_threshold: float = _option(
@@ -144,7 +153,7 @@ class TrainConfig:
         """Checks every option that needs no file; returns self."""
         for option in dataclasses.fields(self):
             value, choices = getattr(self, option.name), option.metadata.get("choices")
-            kind = option.metadata.get("kind") or type(option.metadata.get("published", option.default))
+            kind = type(option.metadata.get("usual", option.default))
             fits = isinstance(value, (int, float) if kind is float else kind)
             if kind in KINDS and (not fits or isinstance(value, bool) != (kind is bool)):
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be {KINDS[kind]}")
@@ -185,6 +194,13 @@ class TrainConfig:
         for name in ("densify_from_iter", "densify_until_iter", "eval_every", "checkpoint_every"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         return self
+
+    @property
+    def gate(self) -> GateOptions:
+        """What a training needs of the background's gate."""
+        assert self.background_gate is not None, "__post_init__ sets it"
+        return GateOptions(self.background_gate, self.background_gate_bound, self.background_gate_start,
+                           self.background_gate_lr)
 
     def importance_options(self) -> ImportanceOptions:
         """The settings of the strategy `importance`. Raises ConfigError."""
@@ -254,7 +270,7 @@ class TrainConfig:
 
     @classmethod
     def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
-        """The options that `record` gave. Raises ValueError where one is missing: a default would be another run."""
+        """The options that `record` gave. Raises ValueError if one is missing: a default would be another run."""
         missing = sorted({option.name for option in dataclasses.fields(cls)} - {*values})
         if missing:
             raise ValueError(f"the option {', '.join(missing)} is missing")
@@ -262,7 +278,7 @@ class TrainConfig:
 
     @classmethod
     def load(cls, folder: str) -> TrainConfig:
-        """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
+        """Reads OUT/config.json. Raises ConfigError if the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
         if not is_folder(folder):
             raise ConfigError(f"{folder}: no such folder; name the output folder of `dsmoe train`")
@@ -295,7 +311,7 @@ class TrainConfig:
 
     @classmethod
     def of_run(cls, folder: str, scene_option: str, resumes: bool = False, **options: Any) -> TrainConfig:
-        """The options of the run in a folder with some set. Raises ConfigError, also where its scene is not there.
+        """The options of the run in a folder with some set. Raises ConfigError, also if its scene is not there.
 
         scene_option: what says where the scene lies now, for that error. resumes: whether that run goes on with them.
         """
@@ -328,7 +344,7 @@ class TrainConfig:
         return texts
 
     def check_continued_by(self, later: TrainConfig) -> None:
-        """Raises ConfigError where `later` cannot continue this run. Comes before `validate`, which knows no run."""
+        """Raises ConfigError if `later` cannot continue this run. Comes before `validate`, which knows no run."""
         differences = self.differences(later)
         if differences:
             raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `--resume -o "
@@ -336,21 +352,28 @@ class TrainConfig:
 
 
 def _recipe_of(strategy: str) -> Dict[str, Any]:
-    """What a strategy sets of the recipe, by option, where strategies differ."""
-    recipe = "importance" if strategy == "importance" else "published"
-    return {option.name: option.metadata[recipe] for option in dataclasses.fields(TrainConfig)
-            if recipe in option.metadata}
+    """What a strategy sets of the options of the recipe in which strategies differ."""
+    return _set_by(STRATEGY_NAMES, strategy)
 
 
 def learned_gate_of(blend_mode: str) -> Dict[str, float]:
-    """How a background gate is learned by default, where blend modes differ."""
-    tails = blend_mode == "smoe"
-    return {"background_gate_bound": 0.0 if tails else 0.03, "background_gate_start": 0.1 if tails else 1.0,
-            "background_gate_lr": 0.03 if tails else 0.01}
+    """How a background gate is learned by default: the options in which blend modes differ."""
+    return _set_by(BLEND_MODES, blend_mode)
+
+
+def _set_by(names: Sequence[str], chosen: Any) -> Dict[str, Any]:
+    """The defaults, for the chosen one, of the options that some of these names set otherwise.
+
+    chosen: as a file has it, so perhaps none of the names.
+    """
+    varied = {option.name: option.metadata for option in dataclasses.fields(TrainConfig)
+              if not set(names).isdisjoint(option.metadata.get("others", ()))}
+    return {option: next((value for name, value in about["others"].items() if name == chosen), about["usual"])
+            for option, about in varied.items()}
 
 
 def holds_run(folder: str) -> bool:
-    """Whether OUT/config.json is there. Raises TrainerError where that cannot be seen."""
+    """Whether OUT/config.json is there. Raises TrainerError if that cannot be seen."""
     return is_file(os.path.join(folder, CONFIG_NAME))
 
 

@@ -95,7 +95,7 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
 
 
 def _check_learned(config: TrainConfig, given: Dict[str, Any]) -> None:
-    """Raises ConfigError where it is given how the background gate is learned, and the gate is not learned."""
+    """Raises ConfigError if it is given how the background gate is learned, and the gate is not learned."""
     useless = [option for option in dataclasses.fields(TrainConfig)
                if option.name in learned_gate_of(config.blend_mode) and option.name in given]
     if not useless or config.background_gate == LEARNED:

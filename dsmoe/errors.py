@@ -42,7 +42,7 @@ def said_of(error: BaseException) -> str:
 
 
 def in_one_line(error: BaseException) -> Optional[str]:
-    """What a command prints of an error in place of a traceback; None where the error is no user's."""
+    """What a command prints of an error in place of a traceback; None if the error is no user's."""
     if isinstance(error, OSError) and error.strerror:  # whose text begins with a number
         return printable(f"{os.fsdecode(error.filename)}: {error.strerror}" if error.filename else error.strerror)
     if isinstance(error, (TrainerError, ImportError, OSError)):
@@ -51,7 +51,7 @@ def in_one_line(error: BaseException) -> Optional[str]:
 
 
 def out_of_memory(error: BaseException) -> Optional[str]:
-    """Whose memory did not suffice, and for how much; None where the error is another one."""
+    """Whose memory did not suffice, and for how much; None if the error is another one."""
     text = str(error)
     if not isinstance(error, MemoryError) and not (
             isinstance(error, RuntimeError) and re.search("out of memory|can't allocate memory|bad_alloc", text)):

@@ -15,9 +15,9 @@ LEAST, MOST = 20_000, 300_000
 
 
 def with_preset(options: Dict[str, Any]) -> Dict[str, Any]:
-    """The options of a training and, of those that are not given, the preset's; the budget is 0 where none is given.
+    """The options of a training and, of those that are not given, the preset's; the budget is 0 if none is given.
 
-    Raises ConfigError where another strategy is given.
+    Raises ConfigError if another strategy is given.
     """
     strategy = options.get("strategy", "importance")
     if strategy != "importance":
@@ -31,7 +31,7 @@ def with_preset(options: Dict[str, Any]) -> Dict[str, Any]:
 
 
 def budget_of(config: TrainConfig) -> int:
-    """How many Gaussians the scene gets without --budget. Raises SceneError where it cannot be read."""
+    """How many Gaussians the scene gets without --budget. Raises SceneError if it cannot be read."""
     from .scenes.scene import read_layout
 
     points = len(read_layout(config).points.subset(config.init_points, config.seed).positions)

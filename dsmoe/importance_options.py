@@ -26,7 +26,7 @@ class ImportanceOptions:
     views: int = _setting(80, lambda x: x >= 1, "at least 1")
     # The most Gaussians that move at a time, as a part of all; 0: none.
     moves: float = _setting(0.1, lambda x: 0 <= x <= 1, "between 0 and 1")
-    # A Gaussian moves where its cost is below this part of the error at its new place.
+    # A Gaussian moves if its cost is below this part of the error at its new place.
     worth: float = _setting(0.2, lambda x: x >= 0, "at least 0")
     # The learning rate of the higher SH bands is so many times that of the recipe.
     bands: float = _setting(2.0, lambda x: x > 0, "above 0")
@@ -37,7 +37,7 @@ class ImportanceOptions:
     # Behind the moves all learning rates but the positions' fall to this part of themselves.
     anneal: float = _setting(1.0, lambda x: x > 0, "above 0")
     # There too the loss has so many times the squared error in place of the absolute one; 0: it keeps that one. With 30
-    # both pull alike where they differ by 1/60.
+    # both pull alike if they differ by 1/60.
     squares: float = _setting(30.0, lambda x: x >= 0, "at least 0")
     # At the end the model is a running average over about this part of densify_until_iter; 0: none.
     average: float = _setting(0.13, lambda x: x >= 0, "at least 0")

@@ -38,7 +38,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
 
     Of a training that has not ended, its checkpoint is measured, and nothing is written.
 
-    scene_folder: where the scene lies, if not where it was trained. Where it is another scene, as one that has changed
+    scene_folder: where the scene lies, if not where it was trained. If it is another scene, as one that has changed
     since, or that is not known, a line says so; another scene's row is not written. measure: as in `evaluate`. A
     folder that cannot be written to is told, no error. Raises TrainerError.
     """
@@ -78,7 +78,7 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
                   rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
     """A renderer for a .ply with the blend mode and the background gate that it records.
 
-    config gives background and antialiasing. Raises TrainerError where what is asked disagrees with the file.
+    config gives background and antialiasing. Raises TrainerError if what is asked disagrees with the file.
     """
     model, recorded = load_model(ply, device)
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
@@ -92,14 +92,14 @@ class OpenedRun(NamedTuple):
 
     renderer: Renderer
     path: str  # its .ply, or the checkpoint
-    so_far: Optional[SoFar]  # what the checkpoint holds, where the training has not ended
+    so_far: Optional[SoFar]  # what the checkpoint holds, if the training has not ended
 
 
 def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
              rasterize: Optional[Rasterize] = None) -> OpenedRun:
     """A renderer for the model of the run that config is of; before its end, of its checkpoint, which a line says.
 
-    Raises TrainerError where there is neither, and where what is asked disagrees with the run.
+    Raises TrainerError if there is neither, and if what is asked disagrees with the run.
     """
     mode = agreed_blend_mode(config.output, config.blend_mode, asked_blend_mode)
     if config.background_gate != LEARNED:
@@ -144,7 +144,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed; with
     `overwrite` any, whose files of the same names are replaced.
     outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
-    depth in the scene's units, 0 where nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
+    depth in the scene's units, 0 if nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
 
     ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: what `open_run`
     opens of the run that config is of, whose record these two must not contradict. Raises TrainerError.

@@ -9,9 +9,8 @@ from diff_smoe_rasterization.gaussians import activate, quaternion_to_matrix
 from diff_smoe_rasterization.lazy_adam import LazyAdam
 from diff_smoe_rasterization.neighbors import distCUDA2
 
-from .scenes.pointcloud import PointCloud
+from .scenes.pointcloud import SH_C0, PointCloud
 
-SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
 INITIAL_OPACITY = 0.1
 LARGEST_LOG = 88.7  # exp of more is infinite in float32
 MIN_SQUARED_DISTANCE = 1e-7  # of coinciding points, so that log scales stay finite

@@ -32,8 +32,8 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
                  device: str = "cpu", **options: Any) -> Trained:
     """Opens the output folder of `dsmoe train`, before its end the checkpoint in it, or a .ply.
 
-    blend_mode, background_gate: needed for a .ply that does not record them; they must agree where something does.
-    options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. None are where the
+    blend_mode, background_gate: needed for a .ply that does not record them; they must agree if something does.
+    options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. There are none if the
     run's scene is not there. Raises TrainerError.
     """
     check_device(device)
@@ -49,18 +49,18 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
 
 
 def check_source(source: str, besides: str = "") -> None:
-    """Raises TrainerError where there is no such folder or file. besides: what a .ply needs, for that error."""
+    """Raises TrainerError if there is no such folder or file. besides: what a .ply needs, for that error."""
     if not is_folder(source) and not is_file(source):
         raise TrainerError(f"{source}: no such file or folder; name the output folder of `dsmoe train`, or a .ply"
                            + (f" {besides}" if besides else ""))
 
 
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:
-    """Where a model is looked at from: the test views of config.scene, else its training views, and their orbit.
+    """The cameras for a model: the test views of config.scene, else its training views, and their orbit.
 
     The views are upright: photographs are often tilted.
 
-    Where the scene is not there, it is an orbit about the Gaussians and one camera on it. needed: raise TrainerError
+    If the scene is not there, it is an orbit about the Gaussians and one camera on it. needed: raise TrainerError
     then.
     """
     if needed or is_folder(config.scene):

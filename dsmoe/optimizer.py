@@ -1,4 +1,4 @@
-"""Adam over the trainable Gaussians, whose moments follow where rows are added, removed or replaced."""
+"""Adam over the trainable Gaussians, whose moments follow when rows are added, removed or replaced."""
 from __future__ import annotations
 
 import math
@@ -77,7 +77,7 @@ class GaussianOptimizer:
     def add_to_average(self, part: float, background_gate: Optional[torch.Tensor] = None) -> None:
         """Takes the average this part of the way to the parameters as they are now; the first call begins it there.
 
-        background_gate: [1] one more, where it is learned.
+        background_gate: [1] one more, if it is learned.
         """
         now = {name: tensor.detach() for name, tensor in self.model.raw.items()}
         if background_gate is not None:
@@ -94,13 +94,13 @@ class GaussianOptimizer:
         return_spare_memory(self.model.raw["means3D"].device)
 
     def keep(self, mask: torch.Tensor) -> None:
-        """Removes the Gaussians where mask [N] (bool) is False."""
+        """Removes the Gaussians whose mask [N] (bool) is False."""
         self.take(mask.nonzero().squeeze(1))  # on a GPU the host waits here, once for all tensors
 
     def take(self, rows: torch.Tensor, new: Optional[Dict[str, torch.Tensor]] = None) -> None:
         """Puts these rows [M] of Gaussians in place of all, in one pass over memory.
 
-        new: raw parameters of the last ones, where they differ from those of their rows. As many of the last ones begin
+        new: raw parameters of the last ones, if they differ from those of their rows. As many of the last ones begin
         without moments.
         """
         new = new or {}
@@ -168,7 +168,7 @@ class GaussianOptimizer:
                          for key, tensor in self._tensors(name).items()})
 
     def _tensors(self, name: str) -> Dict[str, torch.Tensor]:
-        """The parameter, `raw`, its `average` and its moments by their names in Adam's state, where it has these."""
+        """The parameter, `raw`, its `average` and its moments by their names in Adam's state, if it has these."""
         parameter = self.model.raw[name]
         state = {**self.adam.state.get(parameter, {})}
         if name in self.average:
@@ -213,7 +213,7 @@ class GaussianOptimizer:
         return lazy
 
     def start_higher_bands(self) -> None:
-        """Gives `shs` its Adam state where it has none yet, as old as that of `dc`.
+        """Gives `shs` its Adam state if it has none yet, as old as that of `dc`.
 
         While degree 0 is active its gradient would be zero: Adam would leave it where it is and only count the
         step. Skipping that, and taking over the count, gives the same numbers and saves most of the step's time.

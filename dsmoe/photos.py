@@ -60,7 +60,7 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
     """Writes a COLMAP scene of the photographs in a folder: pinhole images, and where each was taken.
 
     matching: "exhaustive" compares all pairs, "sequential" neighbours by name, "auto" all pairs of up to
-    MOST_EXHAUSTIVE. say: is called with a line before each step. Raises SceneError, also where the photographs do not
+    MOST_EXHAUSTIVE. say: is called with a line before each step. Raises SceneError, also if the photographs do not
     connect, and TrainerError without pycolmap.
     """
     _check_folder(photos)
@@ -96,7 +96,7 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
 
 
 def _check_folder(photos: str) -> None:
-    """Raises SceneError where it is no folder."""
+    """Raises SceneError if it is no folder."""
     if is_folder(photos):
         return
     if not is_file(photos):
@@ -111,7 +111,7 @@ def _check_folder(photos: str) -> None:
 def photo_names(folder: str, output: str) -> List[str]:
     """The photographs below a folder, by their paths in it; hidden files and the folder `output` are left out.
 
-    Raises SceneError where they are too few.
+    Raises SceneError if they are too few.
     """
     _check_folder(folder)
     made = os.path.join(os.path.realpath(output), "")
@@ -180,7 +180,7 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
 
 
 def _forget_others(photos: str, names: Sequence[str], work: str, camera_model: str) -> bool:
-    """Removes the database where it is of other photographs, or of another camera model; returns whether it did.
+    """Removes the database if it is of other photographs, or of another camera model; returns whether it did.
 
     COLMAP knows photographs by their names, and takes those that it knows for unchanged. Further ones are welcome.
     """
@@ -210,7 +210,7 @@ def _checksum(path: str) -> str:
 
 
 def _are_of_one_camera(photos: str, names: Sequence[str]) -> bool:
-    """Whether all have one size, and one focal length where they record it."""
+    """Whether all have one size, and one focal length if they record it."""
     kinds = set()
     for name in names:
         path = os.path.join(photos, name)
@@ -287,7 +287,7 @@ def _in_thread(pycolmap: Any, work: Callable[[Any], Any], show: Callable[[], Non
 
 
 def _count_rows(database: str, table: str) -> int:
-    """How many rows are in the file, without what is in its journal yet; 0 where it cannot be read at the moment.
+    """How many rows are in the file, without what is in its journal yet; 0 if it cannot be read at the moment.
 
     immutable: no lock is taken, on which COLMAP would end the process.
     """

@@ -59,7 +59,7 @@ def main(argv: Optional[List[str]] = None) -> int:
 
 
 def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
-    """Makes the scene where none is named, trains both modes, writes results and pictures; returns the rows."""
+    """Makes the scene if none is named, trains both modes, writes results and pictures; returns the rows."""
     given = given_options(arguments)
     progress = not arguments.quiet
     given["device"] = chosen_device(given.get("device"))
@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
 
 
 def default_output(subject: str) -> str:
-    """The folder for a scene where none is named: by its name, with a number where that is another scene's."""
+    """The folder for a scene if none is named: by its name, with a number if that is another scene's."""
     name = MADE_UP_NAME if subject == MADE_UP else os.path.basename(subject)
     for number in itertools.count(1):
         folder = os.path.join(DEFAULT_FOLDER, name if number == 1 else f"{name}_{number}")
@@ -116,7 +116,7 @@ def default_output(subject: str) -> str:
 
 
 def _earlier_files(output: str, subject: str) -> List[str]:
-    """What an earlier comparison on the same scene has written. Raises TrainerError where `output` holds another's."""
+    """What an earlier comparison on the same scene has written. Raises TrainerError if `output` holds another's."""
     record = own_record(output, PROGRAM, folders=("scene", *MODES))
     if record.subject not in ("", subject):
         raise TrainerError(f"{output} holds the models and pictures of another scene, {record.subject}; choose another "

@@ -52,7 +52,7 @@ class Run:
 
     def __init__(self, trainer: Trainer, progress: bool = True, lock: Optional[IO[str]] = None,
                  forecast: Optional[Forecast] = None) -> None:
-        """lock: the folder's, where this process leads. forecast: says how long it will take, where it is to."""
+        """lock: the folder's, if this process leads. forecast: says how long it will take, if it is to."""
         self.trainer = trainer
         self.progress = progress
         self.lock = lock
@@ -62,7 +62,7 @@ class Run:
         self.scalars: Optional[Scalars] = None  # of the run in progress
 
     def resume(self) -> bool:
-        """Continues from the folder's checkpoint; False where there is none yet."""
+        """Continues from the folder's checkpoint; False if there is none yet."""
         path = self._path(CHECKPOINT_NAME)
         if not is_file(path):
             return False
@@ -136,14 +136,14 @@ class Run:
         return row
 
     def save_checkpoint(self) -> None:
-        """Writes the state of trainer, history and losses. Raises TrainerError where that could not be gone on with."""
+        """Writes the state of trainer, history and losses. Raises TrainerError if that could not be gone on with."""
         state = self._state()
         if self.trainer.leads:
             save_checkpoint(self._path(CHECKPOINT_NAME), {**state, "history": self.history, "losses": self.losses})
-        self.trainer.meet()  # where one process ends before the file is whole, torchrun ends the others
+        self.trainer.meet()  # if one process ends before the file is whole, torchrun ends the others
 
     def _state(self) -> Dict[str, Any]:
-        """The trainer's state. Raises TrainerError where a number in it is NaN or infinite."""
+        """The trainer's state. Raises TrainerError if a number in it is NaN or infinite."""
         state = self.trainer.state_dict()
         try:
             if self.trainer.leads:
@@ -180,7 +180,7 @@ class Run:
         trainer.watch.start()
 
     def _path(self, name: str) -> str:
-        """A file to write. Raises TrainerError where the folder is no longer the one in which the run has begun."""
+        """A file to write. Raises TrainerError if the folder is no longer the one in which the run has begun."""
         output = self.trainer.config.output
         if self.lock:
             check_there(output, self.lock)
@@ -193,7 +193,7 @@ class Run:
 
 
 def _check_loss(step: Step) -> float:
-    """The step's loss. Raises TrainerError where it is not finite: nothing that follows would be worth keeping."""
+    """The step's loss. Raises TrainerError if it is not finite: nothing that follows would be worth keeping."""
     loss = float(step.loss.detach())
     if not math.isfinite(loss):
         raise TrainerError(f"iteration {step.iteration}: the loss is {loss}; lower the learning rates")
@@ -201,14 +201,14 @@ def _check_loss(step: Step) -> float:
 
 
 def _model_name(iterations: int) -> str:
-    """Where in its folder a run of so many iterations keeps its model."""
+    """The path, in its folder, of the model of a run of so many iterations."""
     return model_path("", iterations).replace(os.sep, "/")
 
 
 def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = False) -> List[str]:
     """Products and models that earlier runs have written into config.output, their paths in it.
 
-    Raises TrainerError where something is there that this run must not go on with, or replace.
+    Raises TrainerError if something is there that this run must not go on with, or replace.
     """
     output = config.output
     record = read_record(output, TRAIN)
@@ -245,12 +245,12 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     """Trains a scene into config.output; returns the row of results.json.
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
-    of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
-    is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
-    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
-    hand. group: the processes that train together, where there are several; all of them call this. say: is called
+    of threads and the same SIMD level); start it if it has no checkpoint yet. With more iterations than it had, it
+    is extended: its milestones stay, and if it had ended it lacks the update of its last step. overwrite: replace a
+    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, if one is at
+    hand. group: the processes that train together, if there are several; all of them call this. say: is called
     with a line about what was loaded; with it a training on the CPU also says how long it takes. Raises TrainerError
-    before training starts where anything does not fit, as where another run is at work in the folder.
+    before training starts if anything does not fit, such as another run at work in the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
@@ -281,7 +281,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         files = sorted({*PRODUCTS, *models, _model_name(config.iterations)})
         write_record(config.output, TRAIN, Record(os.path.abspath(config.scene), files), earlier)
         if not resume:
-            # First the old options: what is left where this is killed is no run, and --resume does not go on with it.
+            # First the old options: what is left if this is killed is no run, and --resume does not go on with it.
             remove_files(config.output, [CONFIG_NAME])
             remove_files(config.output, [*files, *(scalar_files(config.output) if overwrite else ())])
         config.save(config.output)

@@ -65,7 +65,7 @@ def panel(image):
 
 
 def font():
-    """Of a size that can be read, where Pillow has one (10.1)."""
+    """Of a size that can be read, if Pillow has one (10.1)."""
     try:
         return ImageFont.load_default(20)
     except TypeError:

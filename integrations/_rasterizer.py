@@ -13,14 +13,15 @@ from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.learned_gate import gate_of
 from diff_smoe_rasterization.rasterizer import visible_radii
-from diff_smoe_rasterization.settings import resolve_blend
+from diff_smoe_rasterization.settings import GateMap, resolve_blend
 
-from ._walk import median_of, weights_of
 from .contracts import FEATURES, RESULTS, contract_of
 
 ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",),
               "opacity": ("alpha",)}
-COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums", "largest")  # results that need another walk
+# Results that need another walk, by `contributions` or `gate_map`.
+COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums")
+MAPPED = ("largest", "median_depth")
 
 
 def pixel_rays(settings: Settings, like: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
@@ -96,25 +97,27 @@ def _rendered(names: Sequence[str], settings: Settings, inputs: Dict[str, Any]) 
     """Returns results by their names, and perhaps others, of what the package's own rasterizer knows."""
     found: Dict[str, Any] = {}
     outputs = sorted({output for name in names for output in ON_REQUEST.get(name, ())})
-    if not set(COUNTED).isdisjoint(names):
+    counted, mapped = (not set(asked).isdisjoint(names) for asked in (COUNTED, MAPPED))
+    if not counted and not mapped:
+        rendering = rasterize(settings=settings, outputs=outputs, **inputs)
+    else:
         rendering, splats = rasterize_with_splats(settings=settings, outputs=outputs, **inputs)
+    if mapped:
+        maps = splats.gate_map()
+        largest = maps.gaussians[maps.gaussians >= 0]
+        found["largest"] = torch.bincount(largest, minlength=rendering.radii.numel()).to(rendering.color)
+        found["median_depth"] = _median_depth(settings, inputs, maps)
+    if counted:
         sums = splats.contributions(torch.ones_like(rendering.color[0]))
         found.update(pixels=sums.pixels.to(rendering.color.dtype)[:, None], weights=sums.blend_weights,
                      n_touched=sums.pixels, counts=sums.pixels,
                      opacity_sums=sums.pixels * inputs["opacities"].detach().reshape(-1))
-        if "largest" in names:
-            largest = splats.gate_map().gaussians
-            found["largest"] = torch.bincount(largest[largest >= 0], minlength=len(sums.pixels)).to(sums.blend_weights)
-    else:
-        rendering = rasterize(settings=settings, outputs=outputs, **inputs)
     found.update(color=rendering.color, radii=rendering.radii, inverse_depth=rendering.inverse_depth,
                  is_used=(rendering.radii > 0).to(torch.int32))
     if "alpha" in outputs:
         found["alpha"] = found["opacity"] = share_of_gaussians(rendering.alpha, settings)
     if "depth" in outputs:
         found["depth"] = rendering.depth * found["alpha"]
-    if "median_depth" in names:
-        found["median_depth"] = _median_depth(settings, inputs)
     return found
 
 
@@ -168,24 +171,21 @@ def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torc
     return settings._replace(viewmatrix=moved, projmatrix=moved @ projection, campos=centre)
 
 
-def median_places(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
-    """Returns which Gaussian [H, W] makes a pixel half full, front to back, by its weights; -1 where none does."""
-    with torch.no_grad():
-        given = {name: tensor for name, tensor in inputs.items() if name != "means2D"}
-        alpha = rasterize(settings=settings, outputs=("alpha",), **given).alpha[0]
-        share = share_of_gaussians(alpha, settings)
-        gate_sum = weights_of(settings, given) if resolve_blend(settings)[0] == "smoe" else alpha
-        total = torch.where(share > 0, gate_sum / torch.where(share > 0, share, 1), torch.zeros_like(share))
-        return median_of(settings, given, total)
-
-
-def _median_depth(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
-    """Returns z [1, H, W] of the Gaussians that make pixels half full, 0 where none does; differentiable."""
-    which, means = median_places(settings, inputs), inputs["means3D"]
+def _median_depth(settings: Settings, inputs: Dict[str, Any], maps: GateMap) -> torch.Tensor:
+    """Returns z [1, H, W] of the Gaussians that make pixels half full, 0 if none does; differentiable."""
+    means, which = inputs["means3D"], maps.medians
     if not len(means):
         return means.new_zeros(1, *which.shape)
     view = settings.viewmatrix.to(means)
-    return (means @ view[:3, 2] + view[3, 2])[which.clamp(min=0)].masked_fill(which < 0, 0)[None]
+    depths = means @ view[:3, 2] + view[3, 2]
+    if resolve_blend(settings)[0] == "smoe_std":  # it takes Gaussians in the order of their indices
+        with torch.no_grad():
+            order = depths.argsort()
+            nearest_first = {name: rows[order] for name, rows in inputs.items()
+                             if name != "means2D" and rows is not None and len(rows) == len(order)}
+            which = rasterize_with_splats(settings=settings, **nearest_first)[1].gate_map().medians
+        depths = depths[order]
+    return depths[which.long().clamp(min=0)].masked_fill(which < 0, 0)[None]
 
 
 def with_absolute(columns: int, inputs: Dict[str, Any]) -> Dict[str, Any]:
@@ -221,7 +221,7 @@ def visible_filter(self, means3D, scales=None, rotations=None, cov3D_precomp=Non
 
     means3D: [N, 3]; scales [N, 3] with rotations [N, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]` are
     taken as they are. Which radii are 0 depends on the blend mode: the anchors need that of their rendering.
-    Raises ValueError or TypeError where arguments do not fit, as `rasterize` does.
+    Raises ValueError or TypeError if arguments do not fit, as `rasterize` does.
     """
     return visible_radii(means3D, as_ours(self.raster_settings, {})[0], scales, rotations, cov3D_precomp)
 
@@ -233,7 +233,7 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
     """Returns GaussianRasterizationSettings, GaussianRasterizer and rasterize_gaussians of a contract.
 
     module: the module that the classes belong to. renderer: from the settings and the arguments by name to the results,
-    where `results_of` does not do.
+    if `results_of` does not do.
     """
     entry = contract_of(contract)
     new_settings = [name for name in entry.settings if name not in Settings._fields]

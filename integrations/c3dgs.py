@@ -39,16 +39,16 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
 
     Args:
         sh: [S, K, 3] harmonics. colors_precomp [N, C], instead of them, has a row for each Gaussian.
-        sh_indices: [N] int64, the row of sh that a Gaussian has; not read where sh is absent.
+        sh_indices: [N] int64, the row of sh that a Gaussian has; not read if sh is absent.
         scales, rotations: [G, 3] and [G, 4], used as given. cov3Ds_precomp [N, 6], instead of them, has a row for each
             Gaussian.
-        g_indices: [N] int64, the row of scales and of rotations that a Gaussian has; not read where they are absent.
+        g_indices: [N] int64, the row of scales and of rotations that a Gaussian has; not read if they are absent.
         scale_factors: [N, 1] or [N], what a Gaussian's scales are multiplied by, beside `scale_modifier`; absent: 1.
     The others are those of `diff_smoe_rasterization.rasterize`, and so are types, errors, and what is absent. An index
     that is negative or beyond its codebook raises ValueError. The host looks for one when it meets a tensor of indices
     for the first time, or changed, or with a codebook of another length; on a GPU it waits in that call, in no other.
 
-    Returns: color [C, H, W], radii [N] int32. Gradients equal bit for bit from run to run where those of `rasterize`
+    Returns: color [C, H, W], radii [N] int32. Gradients equal bit for bit from run to run if those of `rasterize`
     do.
     """
     required, _ = tensor_checks("rasterize_gaussians_indexed", "means3D", means3D)

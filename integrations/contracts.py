@@ -147,7 +147,7 @@ CONTRACTS = (
 def ordered(results: Tuple[str, ...]) -> Contract:
     """Returns the entry of a rasterizer like Inria's whose results come in another order: names of WORDS, each once.
 
-    Whatever is free may come with them. Raises KeyError where they are others, or without `color` and `radii`.
+    Whatever is free may come with them. Raises KeyError if they are others, or without `color` and `radii`.
     """
     if len(set(results)) < len(results) or not {"color", "radii"} <= set(results) <= {name for name, _ in WORDS}:
         raise KeyError(",".join(results))
@@ -156,5 +156,5 @@ def ordered(results: Tuple[str, ...]) -> Contract:
 
 
 def contract_of(name: str) -> Contract:
-    """Returns the entry of a name, or of results with commas between them. Raises KeyError where there is none."""
+    """Returns the entry of a name, or of results with commas between them. Raises KeyError if there is none."""
     return ordered(tuple(name.split(","))) if "," in name else {contract.name: contract for contract in CONTRACTS}[name]

@@ -44,11 +44,11 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         means: [N, 3] centres, world.
         quats, scales: [N, 4] quaternions w, x, y, z of any length, and [N, 3] standard deviations.
         opacities: [N].
-        colors: [N, D] or [C, N, D]; where sh_degree is given harmonics [N, K, 3] or [C, N, K, 3].
+        colors: [N, D] or [C, N, D]; if sh_degree is given harmonics [N, K, 3] or [C, N, K, 3].
         viewmats: [C, 4, 4] world to camera, for column vectors; differentiable.
         Ks: [C, 3, 3] focal lengths and principal points in pixels, without skew; they get no gradient and are read by
             the host, which on a GPU waits for them.
-            colors may be None where render_mode has no RGB.
+            colors may be None if render_mode has no RGB.
         near_plane, far_plane: Gaussians with view depth <= near_plane or > far_plane are culled.
         eps2d: what is added to the variances on the image, square pixels.
         radius_clip: Gaussians with a radius <= radius_clip, in pixels, are culled.
@@ -71,7 +71,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
             sum(w) in `alpha`, W / (W + B + lambda T) in `smoe`. In the others without a background gate, 1 wherever a
             gate is open.
         meta: means2d [C, N, 2], pixels, which receives the gradient of the images by them (also in pixels) and passes
-            none on; radii [C, N, 2] int32, 3 sigma of the longer axis twice, 0 where not seen; depths [C, N]; width,
+            none on; radii [C, N, 2] int32, 3 sigma of the longer axis twice, 0 if not seen; depths [C, N]; width,
             height, n_cameras, n_batches; batch_ids, camera_ids and gaussian_ids are None. With `packed` means2d,
             radii and depths have a row for each Gaussian that a camera sees, [M, 2], [M, 2] and [M], and the three
             ids [M] say which.
@@ -159,7 +159,7 @@ def _shape(quats, scales, covars, count):
 
 @torch.no_grad()
 def _image_points(means, viewmats, Ks):
-    """Returns where the centres fall [C, N, 2] in pixels, detached, and their depths [C, N].
+    """Returns the centres on the images [C, N, 2] in pixels, detached, and their depths [C, N].
 
     The centre of the first pixel is at (0.5, 0.5), as gsplat has it.
     """
@@ -172,7 +172,7 @@ def _image_points(means, viewmats, Ks):
 class _Points:
     """meta["means2d"], and what of it goes into the rendering of each camera, so that the gradients come back to it.
 
-    points: [C, N, 2], or [M, 2] where ids, two tensors [M], say which cameras and Gaussians; pixels. shape: (C, N).
+    points: [C, N, 2], or [M, 2] if ids, two tensors [M], say which cameras and Gaussians; pixels. shape: (C, N).
     """
 
     def __init__(self, points, ids, shape, size, with_gradient, absgrad):

@@ -2,7 +2,7 @@
 
 Two public branches share these names. The one that brings SparseGaussianAdam puts `dc` before `shs`, and so does this
 module; the other has no `dc`, and its callers name `shs`. A trainer that finds SparseGaussianAdam here renders with
-`dc` from then on: [N, 1, 3], where shs [N, K - 1, 3] holds only the other coefficients. `fused_ssim` is what the same
+`dc` from then on: [N, 1, 3], if shs [N, K - 1, 3] holds only the other coefficients. `fused_ssim` is what the same
 trainer imports from the package `fused_ssim`, `compute_relocation` what forks with 3DGS-MCMC's strategy import.
 """
 from diff_smoe_rasterization import SparseGaussianAdam, fused_ssim

@@ -18,7 +18,7 @@ def compute_relocation(opacity_old: torch.Tensor, scale_old: torch.Tensor, N: to
                        n_max: int) -> Tuple[torch.Tensor, torch.Tensor]:
     """Returns opacities [M] and scales [M, 3] of Gaussians that N [M] equal ones in one place take over (Eq. 9).
 
-    opacity_old: [M]. scale_old: [M, 3]. N is taken as n_max where it is more; binoms are not read.
+    opacity_old: [M]. scale_old: [M, 3]. N is taken as n_max if it is more; binoms are not read.
     """
     opacities, factors = divided(opacity_old.reshape(-1), N.reshape(-1).clamp(max=n_max))
     return opacities.reshape(opacity_old.shape), factors[:, None] * scale_old

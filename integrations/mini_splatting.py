@@ -26,8 +26,8 @@ class GaussianRasterizer(_Rasterizer):
                      cov3D_precomp=None) -> Dict[str, torch.Tensor]:
         """Returns images: where the ray of each pixel is deepest inside the Gaussian of the largest weight there.
 
-        render [C, H, W]. gidx [1, H, W] int32, which Gaussian; 0 where there is none, as are the following three.
-        out_pts [3, H, W], the point; rendered_depth [1, H, W], its view z; discriminants [1, H, W], above 0 where the
+        render [C, H, W]. gidx [1, H, W] int32, which Gaussian; 0 if there is none, as are the following three.
+        out_pts [3, H, W], the point; rendered_depth [1, H, W], its view z; discriminants [1, H, W], above 0 if the
         ray meets the ellipsoid of 3 sigma. accum_alpha [1, H, W], the share of the pixel that the background has.
         A Gaussian that is deepest behind the camera is not left out. Raises ValueError without Gaussians, or their
         scales and rotations.

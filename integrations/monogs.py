@@ -2,7 +2,7 @@
 
 theta and rho [3] are a small rotation and translation that follow world to view: T becomes exp(rho, theta) T. Their
 values are not read, only their gradients are of use; the trainer moves its camera by them. `n_touched` counts every
-pixel that blended a Gaussian, also where it lies behind others: the original counts those in front, of T > 1/2.
+pixel that blended a Gaussian, also if it lies behind others: the original counts those in front, of T > 1/2.
 """
 from ._rasterizer import classes_of
 

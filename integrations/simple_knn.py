@@ -23,7 +23,7 @@ def distCUDA2(points: torch.Tensor) -> Union[torch.Tensor, Tuple[torch.Tensor, t
     """Mean squared distance of each point [N, 3] to its three nearest others, [N].
 
     Called from a file that unpacks a result of it, it returns the neighbours' indices [N, 3] too, the nearest first.
-    Raises TypeError where the file takes an element of a result and unpacks none: it may mean a result or a point.
+    Raises TypeError if the file takes an element of a result and unpacks none: it may mean a result or a point.
     """
     distances = distances_of(points)
     file = sys._getframe(1).f_code.co_filename

@@ -1,7 +1,7 @@
 """The API of Speedy-Splat's rasterizer: `scores` [N, 1], by whose gradient Gaussians are pruned.
 
 That gradient is here what the removal of a Gaussian changes, `Splats.importance().removal_costs`: exact in each blend
-mode, where the original has the squared derivative by the kernel. The trainer reads only the order of the scores.
+mode, while the original has the squared derivative by the kernel. The trainer reads only the order of the scores.
 `kernel_times` is one NaN: nothing is timed, and the trainer divides by it.
 """
 from __future__ import annotations

@@ -31,12 +31,12 @@ def rasterize_gaussians(means3D, means2D, dc, sh, colors_precomp, opacities, sca
         radii: [N] int32.
         counts: [H, W] int32, zeros; [0] without pixel_weights.
         lists, lists_render, lists_distance: [0], int32 and twice the type of means3D.
-        centers: [N, 2] pixels, and depths: [N] view z; 0 where the radius is.
+        centers: [N, 2] pixels, and depths: [N] view z; 0 if the radius is.
         my_radii: [N] int32, a copy of radii.
         accum_weights, accum_count, accum_blend, accum_dist: [N], int32 the second, [0] without pixel_weights: over the
             pixels that blended a Gaussian the sums of pixel_weights, of 1, of its weight and of the distance from its
             centre in pixels. The weight is alpha T, in `smoe_std` alpha, divided by no gate sum.
-    Raises ValueError or TypeError where pixel_weights does not fit too.
+    Raises ValueError or TypeError if pixel_weights does not fit too.
     """
     rendering, splats = rasterize_with_splats(means3D, opacities, raster_settings, means2D=means2D, dc=dc, shs=sh,
                                               colors_precomp=colors_precomp, scales=scales, rotations=rotations,
@@ -61,7 +61,7 @@ class GaussianRasterizer(diff_smoe_rasterization.GaussianRasterizer):
                 cov3D_precomp=None):
         """Returns thirteen tensors, as `rasterize_gaussians` names them.
 
-        dc: [N, 1, 3], where shs [N, K - 1, 3] holds only the other coefficients; without it shs is [N, K, 3].
+        dc: [N, 1, 3], if shs [N, K - 1, 3] holds only the other coefficients; without it shs is [N, K, 3].
         """
         return rasterize_gaussians(means3D, means2D, dc, shs, colors_precomp, opacities, scales, rotations,
                                    cov3D_precomp, self.raster_settings)

@@ -25,11 +25,11 @@ def scatter(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Optional
 
 def scatter_max(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Optional[torch.Tensor] = None,
                 dim_size: Optional[int] = None) -> Tuple[torch.Tensor, torch.Tensor]:
-    """Returns the largest of the elements of `src` that have the same index along `dim`, and where it is.
+    """Returns the largest of the elements of `src` that have the same index along `dim`, and its place.
 
-    Arguments as for `scatter`. Returns the maxima, 0 where no element has that index, and their int64 positions along
-    `dim`: the first of equal ones, the size of `src` where there is none. The maxima have a gradient by `src`.
-    Raises NotImplementedError where `out` is given.
+    Arguments as for `scatter`. Returns the maxima, 0 if no element has that index, and their int64 positions along
+    `dim`: the first of equal ones, the size of `src` if there is none. The maxima have a gradient by `src`.
+    Raises NotImplementedError if `out` is given.
     """
     if out is not None:
         raise NotImplementedError("scatter_max: out is given; this module offers only maxima in a new tensor")

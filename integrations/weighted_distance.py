@@ -17,7 +17,7 @@ def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch
     Rows of the codebook with an infinity or a NaN, or whose squares overflow, are taken last. Under TF32 or autocast
     the nearest is found with their precision.
     coefs: [N, K]; codebook: [C, K], C > 0, of the same type and on the same device. No gradient.
-    Raises ValueError where the shapes do not fit.
+    Raises ValueError if the shapes do not fit.
     """
     if coefs.dim() != 2 or codebook.dim() != 2 or coefs.shape[1] != codebook.shape[1] or not len(codebook):
         raise ValueError(f"weightedDistance: coefs has shape {list(coefs.shape)}, codebook {list(codebook.shape)}; "

@@ -44,7 +44,7 @@ class Plan(NamedTuple):
     written: bool = False  # whether `apply` wrote files by this plan
 
     def possible(self) -> Plan:
-        """Returns the plan. Raises PatchError where the checkout cannot be patched."""
+        """Returns the plan. Raises PatchError if the checkout cannot be patched."""
         if self.state in ("unknown", "unpatchable", "drifted"):
             trainer = f" ({self.trainer})" if self.trainer else ""
             raise PatchError("\n  ".join([f"the checkout is {self.state}{trainer}:", *self.reasons]))
@@ -198,10 +198,10 @@ def diff(path: PathLike, **options: Any) -> str:
 
 
 def apply(path: PathLike, **options: Any) -> Plan:
-    """Patches a checkout, with the options of `check`; writes nothing where it is patched already.
+    """Patches a checkout, with the options of `check`; writes nothing if it is patched already.
 
     Returns the plan; its `state` is how the checkout was before, `written` whether anything was changed.
-    Raises PatchError where it is refused, and then every file is as it was.
+    Raises PatchError if it is refused, and then every file is as it was.
     """
     planned = check(path, **options).possible()
     todo = {name: data for name, data in planned.after.items() if data != planned.now[name]}
@@ -212,7 +212,7 @@ def apply(path: PathLike, **options: Any) -> Plan:
 def revert(path: PathLike) -> List[str]:
     """Takes the patch out of every file, with your own edits kept; returns their names.
 
-    Raises PatchError, and touches nothing, where a file has no patch that can be taken out.
+    Raises PatchError, and touches nothing, if a file has no patch that can be taken out.
     """
     root, now = Path(path), _files(Path(path))
     before = {name: unpatched(data) for name, data in now.items()}
@@ -249,7 +249,7 @@ def _files(root: Path) -> Dict[str, bytes]:
 def _write(root: Path, files: Mapping[str, bytes], now: Mapping[str, bytes]) -> None:
     """Writes files, each at once: a kill leaves every one as it was or as it becomes. Modes, owners and links stay.
 
-    now: what they were read as. Raises PatchError where one is another one by now, as an editor has saved it.
+    now: what they were read as. Raises PatchError if one is another one by now, as an editor has saved it.
     """
     targets = {name: (root / name).resolve() for name in files}
     for name, target in targets.items():

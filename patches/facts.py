@@ -45,7 +45,7 @@ OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their
 def of_checkout(files: Mapping[str, bytes], script: str = "") -> Set[str]:
     """Returns the facts of a checkout: of its trainer and renderer, if it is like 3DGS, and of what they import of it.
 
-    script: the file that is run, in place of trainer and renderer. Where they reach no rasterizer, as by a name that is
+    script: the file that is run, in place of trainer and renderer. If they reach no rasterizer, as by a name that is
     made up while they run, every file that imports one counts.
     """
     scripts = [name for name, data in files.items() if "/" not in name and b"def training(" in data]
@@ -67,7 +67,7 @@ def packages(facts: Set[str]) -> Set[str]:
 def _reached(files: Mapping[str, bytes], start: Sequence[str]) -> Dict[str, bytes]:
     """Returns the files that those of `start` import, and they themselves. Packages bring their __init__.py."""
     reached: Dict[str, bytes] = {}
-    waiting, folders = list(start), {"", *(name.rpartition("/")[0] for name in start)}  # where a script finds modules
+    waiting, folders = list(start), {"", *(name.rpartition("/")[0] for name in start)}  # for a script's imports
     while waiting:
         name = waiting.pop()
         if name not in files or name in reached:
@@ -294,7 +294,7 @@ def arguments_of_gsplat() -> Set[str]:
 
 
 def _order(found: str) -> Optional[Tuple[str, ...]]:
-    """Returns what results are, by what callers name them; None where a name does not say it, or two say the same."""
+    """Returns what results are, by what callers name them; None if a name does not say it, or two say the same."""
     results = tuple(next((result for result, word in WORDS if re.search(word, name.lower())), "")
                     for name in found.split(", "))
     try:
@@ -344,7 +344,7 @@ def of_one_name(root: Path) -> List[str]:
 def is_for_sparse_adam(root: Path, files: Mapping[str, bytes], facts: Set[str]) -> bool:
     """Whether a checkout was written for SparseGaussianAdam: it cannot do without, has it as its default, or brings it.
 
-    Others import it in a `try`, as 3DGS of 2024 does. Where they find it, they render with `dc`.
+    Others import it in a `try`, as 3DGS of 2024 does. If they find it, they render with `dc`.
     """
     return ("needs " + SPARSE_ADAM in facts or any(BY_DEFAULT.search(data) for data in files.values())
             or any(SPARSE_ADAM.encode() in path.read_bytes()
@@ -352,7 +352,7 @@ def is_for_sparse_adam(root: Path, files: Mapping[str, bytes], facts: Set[str]) 
 
 
 def below(root: Path) -> List[str]:
-    """Says which folders of a folder are checkouts, where it is none."""
+    """Says which folders of a folder are checkouts, if it is none."""
     if (root / GR).is_file():
         return []
     found = sorted({path.parent.parent.relative_to(root).as_posix() for pattern in ("*/", "*/*/")

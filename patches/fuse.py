@@ -26,7 +26,7 @@ def start() -> None:
 
 
 def fused_where_it_fits(adam: Any) -> Any:
-    """Returns a class in the place of torch.optim.Adam: a call makes FusedAdam where that has its arguments."""
+    """Returns a class in the place of torch.optim.Adam: a call makes FusedAdam if that has its arguments."""
     class Adam(adam):
         def __new__(cls, *arguments: Any, **keywords: Any) -> Any:
             if cls is not Adam:  # a class of the trainer's own
@@ -38,9 +38,9 @@ def fused_where_it_fits(adam: Any) -> Any:
 
 
 def fused_where_equal(ssim: Callable[..., Any], differences: Dict[Any, str], *images: Any, **keywords: Any) -> Any:
-    """Returns a trainer's ssim(img1, img2, ...), by `fused_ssim` where that can be.
+    """Returns a trainer's ssim(img1, img2, ...), by `fused_ssim` if that can be.
 
-    img1, img2: [3, H, W] or [B, 3, H, W]. Of the first images of a shape both are computed: where they differ in value
+    img1, img2: [3, H, W] or [B, 3, H, W]. Of the first images of a shape both are computed: if they differ in value
     or gradient the trainer's own stays, and a line on stderr says so. It is also called for other arguments and types,
     and for gradients by img2: the kernel has none of it. differences: by shape, what was found.
     """
@@ -58,7 +58,7 @@ def fused_where_equal(ssim: Callable[..., Any], differences: Dict[Any, str], *im
 
 
 def difference_of(own: Callable[..., Any], img1: Any, img2: Any) -> str:
-    """What a similarity of images differs in from ours, its gradient by img1 too; empty where in nothing."""
+    """What a similarity of images differs in from ours, its gradient by img1 too; empty if in nothing."""
     results = []
     with torch.inference_mode(False), torch.enable_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         try:

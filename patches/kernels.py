@@ -25,7 +25,7 @@ STATEMENTS = {kind: (re.compile(statement), re.compile(expected)) for kind, stat
 
 
 def another_blend(root: Path, packages: Collection[str]) -> str:
-    """Says which statement of a checkout's forward kernels blends something else; "" where none does or none is there.
+    """Says which statement of a checkout's forward kernels blends something else; "" if none does or none is there.
 
     packages: what the checkout imports as its rasterizer; only the kernels of these are read. A statement in a form of
     its own, such as a call of a function that makes alpha, says nothing.

@@ -19,7 +19,7 @@ EIGH_AT_ONCE = 16_384  # cuSOLVER's batched solver of CUDA 12.8 and later fails 
 def start() -> None:
     """Changes modules of this process; README.md has the list and the reasons."""
     sys.path.insert(1, str(STAND_INS))  # behind the script's folder
-    os.environ.setdefault("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # torch.load, where a call does not say
+    os.environ.setdefault("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # torch.load, if a call does not say
     for name in ("int", "float", "bool", "object"):
         if name not in vars(numpy):
             setattr(numpy, name, getattr(builtins, name))

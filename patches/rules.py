@@ -1,6 +1,6 @@
 """The rules of a patch: what each puts into a file.
 
-A rule edits a Source. It raises PatchError where what it looks for is not there, or in a form that it does not know.
+A rule edits a Source. It raises PatchError if what it looks for is not there, or in a form that it does not know.
 """
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def rules_of(trainer: Trainer, files: Mapping[str, bytes], sparse_adam: bool) ->
 
 
 def entries_in(files: Mapping[str, bytes], entries: Sequence[Entry]) -> List[Entry]:
-    """Returns the entries with the files where their functions are: a file of that name, and any script beside it.
+    """Returns the entries with the files of their functions: a file of that name, and any script beside it.
 
-    One that renders may be nowhere. Where a file is there without its function, the rule will say so.
+    One that renders may be nowhere. If a file is there without its function, the rule will say so.
     """
     found: Dict[Tuple[str, str], Entry] = {}
     for entry in entries:
@@ -85,7 +85,7 @@ def import_rasterizer(source: Source, trainer: Trainer, sparse_adam: bool) -> No
 
 
 def _import(source: Source, name: str, found: Sequence[ast.AST]) -> None:
-    """A rule's file gets the import of what the rule put in. Raises PatchError where it found nothing."""
+    """A rule's file gets the import of what the rule put in. Raises PatchError if it found nothing."""
     if not found:
         raise PatchError("no match")
     source.put_on_top(marked(f"from {RUNTIME} import {name}"))

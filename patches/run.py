@@ -33,9 +33,9 @@ FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
         background_gate: Union[float, str, None] = None) -> NoReturn:
-    """Runs the command, and ends with its exit status, or 128 + N where signal N ended it.
+    """Runs the command, and ends with its exit status, or 128 + N if signal N ended it.
 
-    Where this process is killed, the command gets a SIGTERM. Raises PatchError where the command would not run, or did
+    If this process is killed, the command gets a SIGTERM. Raises PatchError if the command would not run, or did
     not, with this rasterizer.
     """
     environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
@@ -127,7 +127,7 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
                          "returns, such as color,depth,median_depth,alpha,radii")
     reasons, everything = [], set()
     for path in (next(iter(files)) / name for name in (RASTERIZER, f"{RASTERIZER}.py")):
-        if path.exists():  # where Python looks first
+        if path.exists():  # Python looks there first
             raise PatchError(f"{path} would be imported before this package's; move it away")
     for folder, texts in files.items():
         inside = script is not None and folder in script.parents
@@ -162,7 +162,7 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
 
 
 def _check_python(program: str, environment: Dict[str, str]) -> None:
-    """Raises PatchError where a Python that would run the trainer has not this package."""
+    """Raises PatchError if a Python that would run the trainer has not this package."""
     if not re.fullmatch(r"python[\d.]*", Path(program).name):
         return
     find = "import importlib.util as u, sys; sys.exit(not (u.find_spec('dsmoe') and u.find_spec('torch')) and 41)"
@@ -173,22 +173,22 @@ def _check_python(program: str, environment: Dict[str, str]) -> None:
 
 
 def _script(words: Sequence[str]) -> Optional[Path]:
-    """Returns the file that a command runs: the first .py, or that of `-m`; None where there is none."""
+    """Returns the file that a command runs: the first .py, or that of `-m`; None if there is none."""
     modules = [after.replace(".", "/") + ".py" for word, after in zip(words, words[1:]) if word == "-m"]
     return next((Path(word).resolve() for word in [*words, *modules]
                  if word.endswith(".py") and Path(word).is_file()), None)
 
 
 def _folders(script: Optional[Path]) -> List[Path]:
-    """Returns where the checkout may be: the script's folder, those above it, the current folder."""
+    """Returns the folders that may be the checkout: the script's folder, those above it, the current folder."""
     folders = [script.parent, *list(script.parent.parents)[:2]] if script else []
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
 def _read(folder: Path, everywhere: bool) -> Dict[str, bytes]:
-    """Returns the Python files in a folder and two levels below it; {} where none imports a rasterizer.
+    """Returns the Python files in a folder and two levels below it; {} if none imports a rasterizer.
 
-    everywhere: also where it is no checkout like that of 3DGS.
+    everywhere: also if it is no checkout like that of 3DGS.
     """
     patterns = ("*.py", "*/*.py", "*/*/*.py") if everywhere or (folder / GR).is_file() else ()
     paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())

@@ -44,7 +44,7 @@ def _begin_gate(frozen: bool) -> None:
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate: that of the mode."""
     keep_records()
-    _check_renderer()  # where only it was restored, the option would be recorded and ignored
+    _check_renderer()  # if only it was restored, the option would be recorded and ignored
     return resolve_blend_mode(None), ""
 
 
@@ -79,7 +79,7 @@ def saved_blend_of(dataset: Any) -> Dict[str, Any]:
 
 
 def _take_saved(dataset: Any) -> None:
-    """Options that are not typed get the values of the model's cfg_args, None where it has none."""
+    """Options that are not typed get the values of the model's cfg_args, None if it has none."""
     saved = _saved(dataset)
     for option in OPTIONS:
         if getattr(dataset, "model_path", "") and not _is_typed(option):
@@ -95,8 +95,8 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
     Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a
     `background_gate`: 0.
     From then on a rendering of this process whose settings name no mode has both.
-    Says on stderr what they are. Warns, once, where one may not be what was meant.
-    Raises ValueError where one is wrong, RuntimeError where the renderer has another rasterizer.
+    Says on stderr what they are. Warns, once, if one may not be what was meant.
+    Raises ValueError if one is wrong, RuntimeError if the renderer has another rasterizer.
     """
     _check_renderer()
     mode, gate = (getattr(dataset, option, None) for option in OPTIONS)  # a gate that is typed is a string
@@ -137,7 +137,7 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
 
 
 def chosen_blend(pipe: Any) -> Dict[str, Any]:
-    """Returns the settings that `blend_of` left. Raises RuntimeError where a script of the user's did not call it."""
+    """Returns the settings that `blend_of` left. Raises RuntimeError if a script of the user's did not call it."""
     if not hasattr(pipe, "blend"):
         raise RuntimeError("this script renders without a blend mode; before it renders it needs the statements `from "
                            f"{__name__} import saved_blend_of` and `pipe.blend = saved_blend_of(dataset)`; where it "
@@ -201,7 +201,7 @@ def gsplat_of_run() -> None:
     """Puts this package's functions into gsplat as it is installed: the rasterizer, and what its strategies compute.
 
     The strategies and all else stay gsplat's own. A gsplat before 1.5 finds radii [C, N], without an axis of two.
-    Where gsplat cannot be had, the package has only `rasterization` and `rendering.rasterization`.
+    If gsplat cannot be had, the package has only `rasterization` and `rendering.rasterization`.
     """
     from diff_smoe_rasterization.integrations import gsplat as ours
     if not is_installed("gsplat"):
@@ -248,7 +248,7 @@ def is_installed(module: str) -> bool:
 
 
 def _check_renderer() -> None:
-    """Raises RuntimeError where the trainer's renderer is not, or no longer, patched: it would ignore the mode."""
+    """Raises RuntimeError if the trainer's renderer is not, or no longer, patched: it would ignore the mode."""
     theirs = getattr(sys.modules.get("gaussian_renderer"), "GaussianRasterizationSettings", None)
     if theirs is not None and "blend_mode" not in getattr(theirs, "_fields", ()):
         raise RuntimeError("gaussian_renderer uses another rasterizer, which has no blend modes: was it restored after "

@@ -2,7 +2,7 @@
 
 Whatever a patch puts into a file carries a mark, by which it is taken out again. So the files themselves say whether
 they are patched, also in a copy, a clone or another commit of the checkout. A mark ends with a digest of what the patch
-wrote: where that was edited, the mark stays, and `leftover` names it.
+wrote: if that was edited, the mark stays, and `leftover` names it.
 
     text  # dsmoe patch DIGEST                      a line of the patch
     # dsmoe patch TRAINER: MODULE DIGEST            the line below it imported from MODULE, and now from another one
@@ -33,7 +33,7 @@ class PatchError(RuntimeError):
 
 
 def tree_of(data: bytes) -> ast.Module:
-    """Returns the syntax tree of a file. Raises PatchError where it has none."""
+    """Returns the syntax tree of a file. Raises PatchError if it has none."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # such as of invalid escapes in a string
@@ -76,7 +76,7 @@ class Source:
     """A file into which lines are put. Its lines keep the numbers that the tree has."""
 
     def __init__(self, data: bytes) -> None:
-        """Raises PatchError where it cannot be parsed."""
+        """Raises PatchError if it cannot be parsed."""
         self.tree = tree_of(data)
         self.bom = codecs.BOM_UTF8 if data.startswith(codecs.BOM_UTF8) else b""
         self.lines = data[len(self.bom):].splitlines(keepends=True)
@@ -95,7 +95,7 @@ class Source:
         return line[:len(line) - len(line.lstrip(b" \t\f"))]
 
     def put(self, text: str, statement: ast.stmt) -> None:
-        """Puts a line before a statement. Raises PatchError where that does not begin a line."""
+        """Puts a line before a statement. Raises PatchError if that does not begin a line."""
         number = min(node.lineno for node in (statement, *getattr(statement, "decorator_list", ())))
         if len(self.indent(number)) != statement.col_offset:
             raise PatchError(f"line {number} has more than one statement")

@@ -22,7 +22,7 @@ from diff_smoe_rasterization import autograd, direct, extension
 from dsmoe.cli import main as dsmoe
 
 LEARNED = 70  # calls after which room is what was seen, and an eighth more
-LEAST_INSTANCES = 2 * 65_536  # more than there is room for where nothing is visible
+LEAST_INSTANCES = 2 * 65_536  # more than there is room for if nothing is visible
 
 
 def graph_of(call: Callable[[], Any]) -> torch.cuda.CUDAGraph:

@@ -1,7 +1,7 @@
 """The rasterizers that gpu_rasterizer.py times: how each is called. Nothing of a peer's is here but its interface.
 
 A peer is imported from the folder of its name below --peers-path, by the process that measures only it: several of
-them share one module name. What all get: activated float32 parameters (raw ones where a peer's interface takes raw
+them share one module name. What all get: activated float32 parameters (raw ones if a peer's interface takes raw
 ones), the same cameras, a black background and the near plane of 3DGS, 0.2.
 """
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Renderer:
         raise NotImplementedError
 
     def render(self, view):
-        """Returns what the backward pass starts from, or the image where there is none."""
+        """Returns what the backward pass starts from, or the image if there is none."""
         raise NotImplementedError
 
     def image(self, output: torch.Tensor) -> torch.Tensor:

@@ -65,7 +65,7 @@ def per_unit(counts: Counts, kept) -> Dict[str, float]:
 
 
 def _grid(num_gaussians: int, columns: int, rows: int, opacity: float, sigma: float):
-    """Round Gaussians in the middles of tiles, several deep where there are more than tiles; sigma in pixels."""
+    """Round Gaussians in the middles of tiles, several deep if there are more than tiles; sigma in pixels."""
     index = torch.arange(num_gaussians)
     x = (index % columns + 0.5) * TILE - columns * TILE / 2
     y = (index // columns % rows + 0.5) * TILE - rows * TILE / 2

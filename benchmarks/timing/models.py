@@ -51,7 +51,7 @@ class Model(NamedTuple):
         return self._replace(inputs={name: tensor.to(device) for name, tensor in self.inputs.items()})
 
     def seen(self, num_views: int, width: Optional[int] = None, height: Optional[int] = None) -> Model:
-        """The model with at most so many of its views, evenly chosen, at another size where one is given."""
+        """The model with at most so many of its views, evenly chosen, at another size if one is given."""
         count = min(num_views, len(self.cameras))
         chosen = [self.cameras[index * len(self.cameras) // count] for index in range(count)]
         return self._replace(cameras=[camera.resized(width or camera.width, height or camera.height)

@@ -319,6 +319,9 @@ template <class Frame> void refuse_gate_map(const char* function, const Frame& f
   refuse_walk(function, frame);
   refuse_null(function, "gaussians", map.gaussians, "[H, W]", 1);
   refuse_null(function, "counts", map.counts, "[H, W]", 1);
+  const bool median = map.medians != nullptr;
+  refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", median);
+  refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", median && has_tails(frame.config.blend.mode));
 }
 
 template <class Frame> void refuse_mark_visible(const char* function, const Frame& frame, const bool* visible) {

@@ -65,7 +65,7 @@ def markdown_files() -> Iterator[Path]:
 
 
 def write_listing(folder: Path, pages: Path) -> None:
-    """The page of a folder that another page links to, where it has none: its files."""
+    """The page of a folder that another page links to, if it has none: its files."""
     if (folder / "README.md").is_file():
         return
     files = [path for path in sorted(folder.iterdir()) if path.is_file()]

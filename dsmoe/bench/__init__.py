@@ -8,7 +8,7 @@ PACKAGES = ("'snakemake>=8'", "pyyaml", "'pydantic>=2'", "torchmetrics", "matplo
 
 
 def require(*libraries: str) -> None:
-    """Raises ImportError, which says what to type, where one of these libraries is not installed."""
+    """Raises ImportError, which says what to type, if one of these libraries is not installed."""
     missing = [name for name in libraries if importlib.util.find_spec(name) is None]
     if missing:
         from ..system.process import pip_install  # it loads torch

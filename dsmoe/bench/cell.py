@@ -118,7 +118,7 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device
     """Runs `work` in a process of its own, which ends with this one, and returns the row that is in OUT then.
 
     gpu: those that the process is given, "0" or "0,1"; None: as the machine has them. per_device: how many cells may
-    have that GPU, or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
+    have that GPU, or on the CPU this machine, at once; None if nobody counts. held: a lock that the process has too.
     """
     cell = read_json(cell_path)
     os.makedirs(output, exist_ok=True)
@@ -145,7 +145,7 @@ def how_it_ended(status: int, log_path: str) -> str:
 
 
 def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Tuple[str, IO[str]]:
-    """Waits for a GPU that fewer than per_gpu cells of these locks have: one that none has, where there is one.
+    """Waits for a GPU that fewer than per_gpu cells of these locks have: one that none has, if there is one.
 
     Returns its name and the lock, which must stay open. Snakemake counts GPUs, but does not say which is free.
     """

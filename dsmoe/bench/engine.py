@@ -52,7 +52,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     """Runs what is not done of a suite; returns the rows of its cells, failed ones included.
 
     name: a file or a shipped suite. results: by default bench_results/NAME. The others are the options of `dsmoe bench
-    run`; slurm: None, or Snakemake's default resources. Raises BenchError. Where nothing is to be done, neither a GPU
+    run`; slurm: None, or Snakemake's default resources. Raises BenchError. If nothing is to be done, neither a GPU
     nor Snakemake is needed.
     """
     suite = load_suite(find_suite(name), device)
@@ -144,7 +144,7 @@ def plan(cells: List[Dict[str, Any]], done: Mapping[str, Row], absent: Sequence[
 
 
 def check_folder(suite: Suite, results: str) -> None:
-    """Raises BenchError where the folder has rows of another suite or of another protocol, or a row that is none."""
+    """Raises BenchError if the folder has rows of another suite or of another protocol, or a row that is none."""
     def parts(cell: Mapping[str, Any]) -> Dict[str, Dict[str, Any]]:
         """What must stay as it is of a scene or a method that is there already; others may be added."""
         return {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
@@ -168,7 +168,7 @@ def check_folder(suite: Suite, results: str) -> None:
 
 
 def check_own(results: str) -> None:
-    """Raises TrainerError where the folder has something in it, and no suite was run there."""
+    """Raises TrainerError if the folder has something in it, and no suite was run there."""
     cells = (os.path.join(results, CELLS_FOLDER, name, CELL_NAME) for name in cell_folders(results))
     if read_record(results, COMMAND) is None and not any(map(os.path.isfile, cells)):
         own_record(results, COMMAND)
@@ -222,7 +222,7 @@ def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, done: M
 
 
 def read_row(results: str, name: str) -> Optional[Row]:
-    """The row in a cell's folder; None where there is none. Raises BenchError where it is damaged or another cell's."""
+    """The row in a cell's folder; None if there is none. Raises BenchError if it is damaged or another cell's."""
     path = os.path.join(results, CELLS_FOLDER, name, ROW_NAME)
     row = read_object(path, CellRow)
     other = name if row is None else row["cell"]

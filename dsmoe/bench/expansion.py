@@ -34,7 +34,7 @@ from .protocol import config_of
 
 Values = Dict[str, Any]
 Axes = Dict[str, List[Any]]
-# Where things lie changes no figure.
+# Paths change no figure.
 NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "base_commit", "unset")
 
 

@@ -9,7 +9,7 @@ LONGEST = 300  # characters of a log's last line
 
 
 def last_line(path: str) -> str:
-    """The last line of a log that says something, which a progress bar does not; empty where nothing was printed."""
+    """The last line of a log that says something, which a progress bar does not; empty if nothing was printed."""
     text = Path(path).read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     lines = [line for line in lines if not PROGRESS_BAR.search(line)] or lines

@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018, v0.1) by torchmetrics, or from a file of weights where there is no network connection."""
+"""LPIPS (Zhang et al. 2018, v0.1) by torchmetrics, or from a file of weights if there is no network connection."""
 from __future__ import annotations
 
 import os
@@ -79,7 +79,7 @@ class FileLpips:
 
 
 def arrays_of(path: str) -> Dict[str, np.ndarray]:
-    """The arrays of a file, lin as [channels]. Raises OSError; ValueError where it is no such file."""
+    """The arrays of a file, lin as [channels]. Raises OSError; ValueError if it is no such file."""
     try:
         with np.load(path) as file:
             return {name: file[name].reshape(-1) if name.startswith("lin") else file[name] for name in file.files}

@@ -39,7 +39,7 @@ class Measures:
     """All metrics of one rendering; LPIPS of each kind whose weights are at hand."""
 
     def __init__(self, device: str, lpips: Sequence[str] = ()) -> None:
-        self.reasons: Dict[str, Optional[str]] = {}  # why a kind of LPIPS is absent; None where it is measured
+        self.reasons: Dict[str, Optional[str]] = {}  # why a kind of LPIPS is absent; None if it is measured
         self._networks: Dict[str, Distance] = {}
         for kind in lpips:
             try:

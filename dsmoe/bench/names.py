@@ -67,7 +67,7 @@ def net_of(kind: str) -> str:
 
 
 def check_weights(kinds: Sequence[str]) -> None:
-    """Raises BenchError where a variable names a file of weights that is wanted and not there."""
+    """Raises BenchError if a variable names a file of weights that is wanted and not there."""
     for kind in kinds:
         variable = VARIABLES[net_of(kind)]
         if os.environ.get(variable) and not os.path.isfile(os.environ[variable]):

@@ -30,7 +30,7 @@ def what_is_missing(cells: List[Dict[str, Any]]) -> List[str]:
 
 
 def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
-    """The scene with its path; a synthetic one is made where it is not there yet, or was made otherwise."""
+    """The scene with its path; a synthetic one is made if it is not there yet, or was made otherwise."""
     if scene["path"] is not None:
         return scene
     from ..scenes.synthetic import write_synthetic_scene  # it loads torch

@@ -10,8 +10,8 @@ from typing import Any, Dict, Optional
 from ..config import TrainConfig
 from .names import RECIPE
 
-COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit where its files are no git checkout
-ROOT = str(Path(__file__).resolve().parents[2])  # where the package lies
+COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit if its files are no git checkout
+ROOT = str(Path(__file__).resolve().parents[2])  # of the package
 BYTES_PER_GAUSSIAN = 4 * 59  # float32 numbers: position 3, SH colours 48, opacity 1, scale 3, quaternion 4
 
 STRONG_GRADIENT = 0.05  # of luminance in [0, 1], per pixel: 13 grey levels from one pixel to the next
@@ -75,7 +75,7 @@ def downscaler(config: TrainConfig, name: str) -> str:
 
 
 def project_commit() -> Optional[str]:
-    """That of this project's files, as `commit_of` has it; None where nothing says it."""
+    """That of this project's files, as `commit_of` has it; None if nothing says it."""
     known = os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT)
     if known is None:
         with contextlib.suppress(ImportError):
@@ -84,7 +84,7 @@ def project_commit() -> Optional[str]:
 
 
 def commit_of(folder: str) -> Optional[str]:
-    """The commit that a checkout is at, "+" behind it where tracked files were changed.
+    """The commit that a checkout is at, "+" behind it if tracked files were changed.
 
     None without git, and for a folder inside of another checkout, whose commit says nothing about it.
     """

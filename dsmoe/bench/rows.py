@@ -22,7 +22,7 @@ Number = Annotated[float, must(lambda value: abs(value) < LARGEST, FINITE)]  # N
 Decibels = Annotated[float, must(lambda value: abs(value) < LARGEST or value == math.inf, FINITE)]
 Gate = Annotated[Any, must(lambda value: value in (None, LEARNED) or (
     type(value) in (int, float) and abs(value) < LARGEST), f"{FINITE} or {LEARNED!r}")]
-# What two rows of one scene must share to be comparable, where both say it.
+# What two rows of one scene must share to be comparable, if both say it.
 RULES = ("split", "train_views", "test_views", "resolution", "image_size", "downscaler", "background",
          "principal_point", "sh_degree", "recipe", "scale_recipe")
 RULE_PREFIXES = ("psnr", "ssim", "lpips", "edge", "fps", "size", "quantisation")
@@ -63,7 +63,7 @@ CellFile = create_model("CellFile", __base__=Part, suite=(str, ...),
 
 
 def read_object(path: str, model: Type[Any] = dict) -> Optional[Dict[str, Any]]:
-    """The object of a .json file; None where there is no file. Raises BenchError where it is damaged."""
+    """The object of a .json file; None if there is no file. Raises BenchError if it is damaged."""
     if not os.path.isfile(path):
         return None
     try:

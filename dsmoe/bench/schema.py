@@ -1,4 +1,4 @@
-"""What a suite file may say, and what holds where it says nothing; expansion.py checks what goes together."""
+"""What a suite file may say, and what holds if it says nothing; expansion.py checks what goes together."""
 from __future__ import annotations
 
 import math
@@ -84,7 +84,7 @@ Options = create_model("Options", __base__=Part, **{
 
 class Protocol(Part):
     iterations: Positive = 30_000
-    batch: Positive = None  # views a step; this and gpus stand only where they are given, as in earlier rows
+    batch: Positive = None  # views a step; this and gpus stand only if they are given, as in earlier rows
     gpus: Positive = None  # of each cell
     device: Literal["auto", "cpu", "cuda"] = "cuda"  # auto is resolved before the cells are made
     background: Background = "black"

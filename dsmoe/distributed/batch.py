@@ -54,7 +54,7 @@ class DrawnImage:
                       self._options[:-1])
 
     def backward(self, dL_dcolor: torch.Tensor, wants_gate: bool) -> Tuple[torch.Tensor, torch.Tensor]:
-        """Gradients by the footprints, [M, 6 + F], and by the background's gate, [1], or [0] where it is not wanted."""
+        """Gradients by the footprints, [M, 6 + F], and by the background's gate, [1], or [0] if it is not wanted."""
         radii, bg, gate = self._tensors[2:]
         records, _, dL_dgate = _OPS.blend_backward(dL_dcolor, None, None, None, self._images, self._saved, radii, bg,
                                                    gate, *self._options, wants_gate)
@@ -66,7 +66,9 @@ class Batch:
 
     def __init__(self, group: Group, gaussians: Dict[str, torch.Tensor],
                  settings: Sequence[GaussianRasterizationSettings], note: int = 0) -> None:
-        """Projects and sends. gaussians: the arguments of a rendering that have a row for each own one.
+        """Projects this process's Gaussians, and sends their footprints.
+
+        gaussians: those arguments of a rendering that have a row for each Gaussian.
 
         settings: of each view. note: a number; `notes` has those of all processes.
         """
@@ -111,7 +113,7 @@ class Batch:
 
     @property
     def radii(self) -> torch.Tensor:
-        """[N] int32 above 0 where a view shows the own Gaussian."""
+        """[N] int32 above 0 if a view shows the own Gaussian."""
         return torch.stack([projected.radii for projected in self.projected]).amax(0)
 
     def draw(self, view: int, settings: GaussianRasterizationSettings, for_backward: bool = True) -> DrawnImage:
@@ -198,5 +200,5 @@ def gaussians_of(model: GaussianModel) -> Dict[str, torch.Tensor]:
 
 
 def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """All rows of the parts, copied only where there are several parts."""
+    """All rows of the parts, copied only if there are several parts."""
     return parts[0] if len(parts) == 1 else torch.cat(list(parts))

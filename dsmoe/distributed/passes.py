@@ -12,7 +12,7 @@ from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer
 from ..scenes.images import View
 from ..system.group import Group
-from ..training.background_gate import LearnedGate
+from ..training.gate import LearnedGate
 from ..training.passes import Compare, DirectPasses, ViewOver
 from ..training.strategy import Look, Step, look_at
 from .batch import Batch, gaussians_of

@@ -18,11 +18,11 @@ from ..training.strategy import Step, Strategy, StrategyContext
 from ..training.trainer import Trainer
 
 RISE = 0.4  # the part of the iterations in which the background gate goes to 1
-LEAST_GATE = 0.01  # where a gate of 0 begins, which no factor raises
+LEAST_GATE = 0.01  # begins in place of 0, which no factor raises
 
 
 class Baked(NamedTuple):
-    """A model for alpha, and the mean PSNR of the test views in dB; None where the scene has none."""
+    """A model for alpha, and the mean PSNR of the test views in dB; None if the scene has none."""
 
     renderer: Renderer
     trained: Optional[float]  # before, in its own blend

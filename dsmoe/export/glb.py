@@ -11,7 +11,7 @@ from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
-from ..model import SH_C0
+from ..scenes.pointcloud import SH_C0
 from .rows import rotatable_rows, sigmoid, y_up
 
 SPLATTING = "KHR_gaussian_splatting"
@@ -35,8 +35,8 @@ class Blend(NamedTuple):
 def glb_bytes(gaussians: Gaussians, blend: Optional[Blend]) -> bytes:
     """The file's content, in the axes of glTF (y up). blend: None for alpha.
 
-    Left out are Gaussians that are not finite, and those whose quaternion is 0. Raises TrainerError where none is left,
-    as glTF has no empty arrays, and where they are too many.
+    Left out are Gaussians that are not finite, and those whose quaternion is 0. Raises TrainerError if none is left,
+    as glTF has no empty arrays, and if they are too many.
     """
     attributes = _attributes(gaussians, fallback=blend is None)
     count = len(attributes["POSITION"])

@@ -17,7 +17,7 @@ FEWEST_FRACTIONAL_BITS, MOST_FRACTIONAL_BITS = 10, 20
 
 
 def check_spz() -> None:
-    """Raises TrainerError where this environment cannot write such a file."""
+    """Raises TrainerError if this environment cannot write such a file."""
     try:
         import gsply  # noqa: F401
     except ImportError as error:

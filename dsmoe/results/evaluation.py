@@ -26,7 +26,7 @@ METRICS = ("psnr", "ssim", "psnr_float")  # what image_metrics gives
 class Evaluation:
     """Means over views, each view counting once."""
 
-    metrics: Dict[str, Optional[float]]  # psnr, ssim, psnr_float and what else was measured; None where there are none
+    metrics: Dict[str, Optional[float]]  # psnr, ssim, psnr_float and what else was measured; None if there are none
     fps: Optional[float]  # 1 / mean seconds of a view, images rendered and nothing else
     per_view: List[Dict[str, object]]  # name, metrics and milliseconds of each view
 

@@ -18,7 +18,7 @@ def quantised(image: torch.Tensor) -> torch.Tensor:
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None) -> float:
     """Peak signal-to-noise ratio in dB of one image [3, H, W], the squared error averaged over pixels and channels.
 
-    mask: [1, H, W] in [0, 1], how much each pixel counts. Infinite for equal images, NaN where a pixel is.
+    mask: [1, H, W] in [0, 1], how much each pixel counts. Infinite for equal images, NaN if a pixel is.
     """
     mean_squared_error = _mean((image - target).double().pow(2), mask)
     return math.inf if mean_squared_error == 0 else -10 * math.log10(mean_squared_error)
@@ -53,7 +53,7 @@ def _mean(values: torch.Tensor, mask: Optional[torch.Tensor]) -> float:
 def image_metrics(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None) -> Dict[str, float]:
     """Metrics of one rendering [3, H, W] against its ground truth in [0, 1], over what the mask [1, H, W] keeps.
 
-    psnr, ssim: on 8-bit values (the headline). psnr_float: on floats clamped to [0, 1]. All of them are NaN where a
+    psnr, ssim: on 8-bit values (the headline). psnr_float: on floats clamped to [0, 1]. All of them are NaN if a
     pixel of the rendering is NaN or infinite.
     """
     if not bool(torch.isfinite(image).all()):  # clamping would hide the infinite ones

@@ -17,18 +17,18 @@ from ..errors import TrainerError
 from ..model import GaussianModel, finite_rows
 from ..system.files import new_file
 
-FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
+FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, as viewers of 3DGS expect it
 
 
 class Recorded(NamedTuple):
-    """What a file says of the blend that its Gaussians were trained with; None where it does not."""
+    """What a file says of the blend that its Gaussians were trained with; None if it does not."""
 
     blend_mode: Optional[str]
     background_gate: Optional[float]
 
 
 def model_path(output: str, iteration: int) -> str:
-    """Where a run keeps its Gaussians of that iteration."""
+    """The path of a run's Gaussians of that iteration."""
     return os.path.join(output, FOLDER, f"iteration_{iteration}", "point_cloud.ply")
 
 
@@ -46,7 +46,7 @@ def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate
 def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     """Reads a .ply; returns the model, all its SH degrees active, and what the file says of its blend.
 
-    Raises TrainerError naming file and reason, also where no Gaussian can be shown.
+    Raises TrainerError naming file and reason, also if no Gaussian can be shown.
     """
     try:
         stored = io.read_gaussians(path)
@@ -72,9 +72,9 @@ def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tens
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
-    """The blend mode to render a .ply with: the recorded one, or the one asked for where none is recorded.
+    """The blend mode to render a .ply with: the recorded one, or the one asked for if none is recorded.
 
-    Raises TrainerError where neither is known, where they disagree, or where the recorded one is unknown.
+    Raises TrainerError if neither is known, if they disagree, or if the recorded one is unknown.
     """
     if recorded is not None and recorded not in BLEND_MODES:
         raise TrainerError(f"{path}: its comment records the blend mode {recorded!r}; this version knows "

@@ -81,7 +81,7 @@ class Renderer:
 
     def settings_of(self, camera: Camera, background: Optional[torch.Tensor] = None,
                     background_gate: Optional[torch.Tensor] = None) -> GaussianRasterizationSettings:
-        """The camera's settings; its matrices stay on the device, where sending them anew would hold up the step.
+        """The camera's settings; its matrices stay on the device: sending them anew would hold up the step.
 
         background, background_gate: in place of the renderer's.
         """

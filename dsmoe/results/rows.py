@@ -7,7 +7,7 @@ from typing import Any, Dict, List, Optional, Union
 
 from diff_smoe_rasterization.settings import GATED_MODES
 
-from ..config import LEARNED, TrainConfig
+from ..config import LEARNED, TrainConfig, learned_gate_of
 from ..errors import TrainerError
 from ..importance_options import importance_settings
 from ..scenes.images import DOWNSCALER
@@ -28,12 +28,13 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     """
     views = list(scene.test) or list(scene.train)
     first = views[0].camera
-    # Named only where they are not as usual, so that other rows stay comparable with earlier ones.
+    # Named only if they are not as usual, so that other rows stay comparable with earlier ones.
     unusual: Dict[str, Any] = {}
     if config.background_gate == LEARNED:
         unusual.update(background_gate_learned=True, background_gate_bound=config.background_gate_bound)
-        for name, value in (("background_gate_start", 1.0), ("background_gate_lr", 0.01)):
-            if getattr(config, name) != value:
+        usual = learned_gate_of("smoe_eq7")
+        for name in ("background_gate_start", "background_gate_lr"):
+            if getattr(config, name) != usual[name]:
                 unusual[name] = getattr(config, name)
     if config.batch > 1:
         unusual["batch"] = config.batch
@@ -93,7 +94,7 @@ def write_results(folder: str, rows: List[Dict[str, Any]]) -> None:
 
 
 def read_results(folder: str) -> List[Dict[str, Any]]:
-    """The rows of OUT/results.json; none where the file is absent. Raises TrainerError where it is damaged."""
+    """The rows of OUT/results.json; none if the file is absent. Raises TrainerError if it is damaged."""
     path = os.path.join(folder, RESULTS_NAME)
     if not is_file(path):
         return []
@@ -132,7 +133,7 @@ def blend_name(blend_mode: str, background_gate: Union[float, str, None]) -> str
 
 
 def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:
-    """What whoever opens the row's model in a viewer has to know; empty where it is blended by alpha.
+    """What whoever opens the row's model in a viewer has to know; empty if it is blended by alpha.
 
     form: the model file's ending.
     """

@@ -1,4 +1,4 @@
-"""Numbers of a training for TensorBoard, in OUT/tensorboard; none are written where tensorboard is not installed."""
+"""Numbers of a training for TensorBoard, in OUT/tensorboard; none are written if tensorboard is not installed."""
 from __future__ import annotations
 
 import glob
@@ -44,7 +44,7 @@ class Scalars:
 
 
 def scalar_files(output: str) -> List[str]:
-    """The files of earlier runs, by their paths in the run's folder; none where its folder for them is a link."""
+    """The files of earlier runs, by their paths in the run's folder; none if its folder for them is a link."""
     if os.path.islink(os.path.join(output, FOLDER)):
         return []
     found = glob.glob(os.path.join(glob.escape(output), FOLDER, "events.out.tfevents.*"))

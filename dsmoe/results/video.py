@@ -22,7 +22,7 @@ def is_video(path: str) -> bool:
 
 
 def check_folder(path: str, orbit: bool) -> None:
-    """Raises TrainerError where a folder for images has the name of a video. orbit: whether a video could be made."""
+    """Raises TrainerError if a folder for images has the name of a video. orbit: whether a video could be made."""
     ending = os.path.splitext(path)[1].lower()
     if ending in FORMATS and not orbit:
         raise TrainerError(f"{path}: a video is written with --orbit; without it -o names a folder")
@@ -32,7 +32,7 @@ def check_folder(path: str, orbit: bool) -> None:
 
 
 def check_video(path: str) -> None:
-    """Raises TrainerError where this environment cannot write such a file."""
+    """Raises TrainerError if this environment cannot write such a file."""
     if path.lower().endswith(".webp") and not features.check("webp"):
         raise TrainerError(f"{path}: this Pillow was built without WebP; .gif and a folder of PNGs need nothing")
     if path.lower().endswith(".mp4"):

@@ -59,7 +59,7 @@ class Camera:
 
 
 def quaternion_to_rotation(quaternion: Sequence[float]) -> np.ndarray:
-    """[3, 3] float64 for a quaternion (w, x, y, z), normalised here. Raises ValueError where all of it is 0."""
+    """[3, 3] float64 for a quaternion (w, x, y, z), normalised here. Raises ValueError if all of it is 0."""
     w, x, y, z = np.asarray(quaternion, np.float64)
     length = np.sqrt(x * x + y * y + z * z + w * w)
     if length == 0:
@@ -87,8 +87,8 @@ def scene_extent(centers: np.ndarray) -> float:
     """The scale of a scene as 3DGS takes it: 1.1 times the largest distance of a camera from their mean.
 
     centers: [V, 3] positions of the training cameras. A single camera (or several in one place) gives 1.0,
-    where the formula would give 0 and stop all positions.
+    if the formula would give 0 and stop all positions.
     """
     radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) * 1.1
-    # Centres computed from poses differ by rounding even where they are one place.
+    # Centres computed from poses differ by rounding even if they are one place.
     return radius if radius > 1e-6 * max(1.0, float(np.abs(centers).max())) else 1.0

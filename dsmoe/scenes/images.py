@@ -40,19 +40,19 @@ class View:
     image: torch.Tensor  # [3, H, W] uint8, over black or white
     opacity: Optional[torch.Tensor] = None  # [1, H, W] uint8; --random-background: the alpha plane, if there is one
     mask: Optional[torch.Tensor] = None  # [1, H, W] uint8: 255, the pixel counts, to 0; None: all count
-    checksum: str = ""  # of the image's file and the mask's, where it was asked for; else empty
+    checksum: str = ""  # of the image's file and the mask's, if it was asked for; else empty
 
     def image_float(self) -> torch.Tensor:
         """[3, H, W] in [0, 1]"""
         return as_float(self.image)
 
     def image_over(self, color: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-        """[3, H, W] in [0, 1]: an image with opacity over another colour [3] than `background` [3], where it lies."""
+        """[3, H, W] in [0, 1]: an image with opacity over another colour [3] than its `background` [3]."""
         clear = 1 - as_float(self.opacity)
         return (self.image_float() + clear * (color - background)[:, None, None]).clamp(0, 1)
 
     def mask_float(self) -> Optional[torch.Tensor]:
-        """[1, H, W] in [0, 1]; None where every pixel counts."""
+        """[1, H, W] in [0, 1]; None if every pixel counts."""
         return None if self.mask is None else as_float(self.mask)
 
     def to(self, device: str) -> View:
@@ -193,7 +193,7 @@ def check_depth(image: Image.Image) -> None:
 
 
 def composited(image: Image.Image, white: bool) -> Image.Image:
-    """The image as RGB; where it has transparency, over white or black. Raises ValueError beyond 8 bits a channel."""
+    """The image as RGB; if it has transparency, over white or black. Raises ValueError beyond 8 bits a channel."""
     check_depth(image)
     if not is_transparent(image):
         return image.convert("RGB")

@@ -23,7 +23,7 @@ class PosedImage:
     path: str
     mask: Optional[str] = None  # the file that says which pixels count
     lens: Optional[Lens] = None  # what bends the image; the camera is the pinhole camera without it
-    made_from: str = ""  # where image and mask are copies without distortion: a checksum of what they are made from
+    made_from: str = ""  # if image and mask are copies without distortion: a checksum of what they are made from
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Layout:
 
     @property
     def warning(self) -> str:
-        """A line about missing images; empty where there are none."""
+        """A line about missing images; empty if there are none."""
         if not self.missing:
             return ""
         every = len(self.missing) + len(self.train) + len(self.test)
@@ -64,7 +64,7 @@ def hold_out(images: Sequence[PosedImage], every: int = 8) -> Tuple[List[PosedIm
 def without_missing(folder: str, layout: Layout, strict: bool) -> Layout:
     """The layout without images whose files are not there; what is a test image does not change by that.
 
-    Raises SceneError where all training images are missing, with `strict` where any image is.
+    Raises SceneError if all training images are missing, with `strict` if any image is.
     """
     every = [*layout.train, *layout.test]
     missing = [image for image in every if not is_file(image.path)]
@@ -77,10 +77,10 @@ def without_missing(folder: str, layout: Layout, strict: bool) -> Layout:
 
 
 def with_masks(folder: str, layout: Layout) -> Layout:
-    """The layout with each image's mask, where the scene has a folder of masks.
+    """The layout with each image's mask, if the scene has a folder of masks.
 
     A mask is named as its image, with .png behind the name or in place of its extension, in the same subfolder.
-    Raises SceneError where an image has none.
+    Raises SceneError if an image has none.
     """
     masks = os.path.join(folder, MASKS)
     if any(image.mask for image in [*layout.train, *layout.test]):  # the scene's own file names them

@@ -34,7 +34,7 @@ class Lens:
 
 
 def lens_of(model: str, is_fisheye: bool, coefficients: Dict[str, float]) -> Optional[Lens]:
-    """The lens with these coefficients, by name; None where it bends nothing."""
+    """The lens with these coefficients, by name; None if it bends nothing."""
     values = tuple(coefficients.get(name, 0.0) for name in (FISHEYE if is_fisheye else PERSPECTIVE))
     return Lens(model, is_fisheye, values) if is_fisheye or any(values) else None
 

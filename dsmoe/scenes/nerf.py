@@ -16,14 +16,13 @@ from diff_smoe_rasterization import io
 
 from ..config import TrainConfig
 from ..errors import SceneError, said_of
-from ..model import SH_C0
 from ..system.files import is_file
 from .cameras import LARGEST, Camera
 from .images import image_size
 from .layout import Layout, PosedImage, hold_out
 from .lens import Lens, lens_of
 from .orbit import orbit_of_cameras
-from .pointcloud import PointCloud
+from .pointcloud import SH_C0, PointCloud
 
 TRANSFORMS = "transforms.json"
 RANDOM_POINTS = 100_000  # as 3DGS
@@ -37,7 +36,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def read_nerf_layout(folder: str, config: TrainConfig) -> Layout:
-    """Reads both json files and points3d.ply where there is one; else points are random. Raises SceneError."""
+    """Reads both json files and points3d.ply if there is one; else points are random. Raises SceneError."""
     train = _read_transforms(folder, "transforms_train.json")
     test = []
     if is_file(os.path.join(folder, "transforms_test.json")):
@@ -75,7 +74,7 @@ def _listed_split(folder: str, path: str, content: Dict[str, Any], images: List[
         Tuple[List[PosedImage], List[PosedImage], str]]:
     """The split that nerfstudio's lists of file names make; None without such lists.
 
-    Where only one list is there, all other frames are of the other kind. Raises SceneError.
+    If only one list is there, all other frames are of the other kind. Raises SceneError.
     """
     lists: Dict[str, List[str]] = {}
     for kind in ("train", "test", "val"):
@@ -194,7 +193,7 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
                          "it must be a rotation")
     camera_to_world = matrix[:3, :3] @ FLIP
     rotation = camera_to_world.T
-    # Intrinsics in pixels refer to the size that the json gives, where it gives one.
+    # Intrinsics in pixels refer to the size that the json gives, if it gives one.
     json_width, json_height = whole("w", width), whole("h", height)
     given = "fl_x" in frame or "fl_x" in content
     focal_x = positive("fl_x", 0) if given else _focal(content, frame, json_width, where)

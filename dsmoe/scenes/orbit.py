@@ -67,7 +67,7 @@ def upright(camera: Camera, up: np.ndarray) -> Camera:
 def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray:
     """[3] unit: what is up in the world, if photographers hold their cameras level.
 
-    It is perpendicular to the horizontal axes of the images, however high or low the cameras look. Where these axes
+    It is perpendicular to the horizontal axes of the images, however high or low the cameras look. If these axes
     run parallel, or cameras are turned by 90 degrees, it is the mean of the images' vertical axes.
     """
     mean = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
@@ -82,7 +82,7 @@ def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray:
 def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
     """The orbit of a capture: as far from the target and as high above it as the cameras are on average.
 
-    The target is the point nearest to all optical axes. Where they run parallel, it lies in front of the cameras by
+    The target is the point nearest to all optical axes. If they run parallel, it lies in front of the cameras by
     twice their spread.
     """
     centers = np.stack([camera.center for camera in cameras])
@@ -108,7 +108,7 @@ def orbit_of_points(positions: np.ndarray) -> Orbit:
     """An orbit about the middle of points [N, 3], for a model without a scene; -y is up, as COLMAP mostly has it.
 
     Points that are not finite or too far away are left out. Without points it is about the origin. Raises SceneError
-    where all of several are left out.
+    if all of several are left out.
     """
     near = positions[(np.abs(positions) <= LARGEST).all(axis=1)]
     if len(near) < 1 <= len(positions):
@@ -122,7 +122,7 @@ def orbit_of_points(positions: np.ndarray) -> Orbit:
 
 
 def default_camera() -> Camera:
-    """A camera at the origin for where no scene gives one; only its size and its intrinsics are meant."""
+    """A camera at the origin, if no scene gives one; only its size and its intrinsics are meant."""
     width, height = SIZE
     focal = height / (2 * math.tan(FIELD_OF_VIEW / 2))
     return Camera("default", np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height)

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import SceneError
 
+SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi)): a colour is 1/2 + SH_C0 dc
 MIN_POINTS = 4  # each scale is the distance to three neighbours
 
 
@@ -18,14 +19,14 @@ class PointCloud:
     colors: np.ndarray  # [N, 3] float64 in [0, 1]
 
     def subset(self, count: int, seed: int) -> PointCloud:
-        """A random choice of `count` points, in their original order; all of them where there are no more."""
+        """A random choice of `count` points, in their original order; all of them if there are no more."""
         if count == 0 or count >= len(self.positions):
             return self
         chosen = np.sort(np.random.RandomState(seed).choice(len(self.positions), count, replace=False))
         return PointCloud(self.positions[chosen], self.colors[chosen])
 
     def checked(self, source: str) -> PointCloud:
-        """Returns self; raises SceneError naming `source` where there are too few points or float32 cannot hold one."""
+        """Returns self; raises SceneError naming `source` if there are too few points or float32 cannot hold one."""
         if len(self.positions) < MIN_POINTS:
             raise SceneError(f"{source}: {len(self.positions)} points; training needs at least {MIN_POINTS} to start")
         finite = np.isfinite(self.positions).all(axis=1)

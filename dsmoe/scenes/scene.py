@@ -52,7 +52,7 @@ def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layo
                checksums: bool = True) -> Scene:
     """Reads the folder config.scene with the config's resolution, background, principal point and initial points.
 
-    layout: what `read_layout` gave, where it is at hand. checksums: whether `scene_fingerprint` is to know the images'
+    layout: what `read_layout` gave, if it is at hand. checksums: whether `scene_fingerprint` is to know the images'
     content, as a training must, which can be resumed. Raises SceneError naming the file and the reason.
     """
     layout, note = undistorted(layout or read_layout(config), config.scene, progress)
@@ -91,7 +91,7 @@ def read_layout(config: TrainConfig) -> Layout:
 
 
 def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
-    """What was loaded, in a line, or two where images were undistorted; layout: what the scene was loaded from."""
+    """What was loaded, in a line, or two if images were undistorted; layout: what the scene was loaded from."""
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
     size = " to ".join(f"{width}x{height}" for width, height in sizes[::max(1, len(sizes) - 1)])
     first, file_size = scene.train[0].camera, image_size(layout.train[0].path)
@@ -135,7 +135,7 @@ def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
 
 
 def difference_of(scene: Scene, recorded: Mapping[str, Any]) -> str:
-    """The first difference from a recorded `scene_fingerprint`, as "NAME X there and Y"; "" where there is none."""
+    """The first difference from a recorded `scene_fingerprint`, as "NAME X there and Y"; "" if there is none."""
     for name, here in scene_fingerprint(scene).items():
         there = recorded.get(name)
         if here != there:

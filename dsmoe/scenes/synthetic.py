@@ -81,7 +81,7 @@ class Rectangle:
         return np.stack([self.axis_u, self.axis_v, np.cross(self.axis_u, self.axis_v)], axis=1)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """[R] distances along the rays, FAR where they miss."""
+        """[R] distances along the rays, FAR if they miss."""
         frame = self.frame
         # einsum, not @: BLAS would start threads of its own inside each of ours.
         start = np.einsum("ij,jk->ki", origins - self.origin, frame)
@@ -108,7 +108,7 @@ class Sphere:
     texture: Texture
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """[R] distances along the (unit) rays, FAR where they miss."""
+        """[R] distances along the (unit) rays, FAR if they miss."""
         offset = origins - self.center
         half_b = np.einsum("ij,ij->i", offset, directions)
         discriminant = half_b**2 - (np.einsum("ij,ij->i", offset, offset) - self.radius**2)

@@ -39,14 +39,14 @@ SAMPLES = 4096  # of the distortion along a radius
 
 @dataclass(frozen=True)
 class _Plan:
-    """What a bent image becomes: where that is kept, by what it is made of."""
+    """What a bent image becomes: its files in the cache, named by what it is made of."""
 
     bent: PosedImage
     camera: Camera  # of the pinhole image: the file's size
     content: str  # checksum of the image's file
-    mask_content: str  # and of its own mask's; empty where it has none
+    mask_content: str  # and of its own mask's; empty if it has none
     path: str  # the pinhole image
-    mask: str  # which of its pixels count; where all do, `_all(mask)` is there in its place
+    mask: str  # which of its pixels count; if all do, `_all(mask)` is there in its place
 
     @property
     def has_image(self) -> bool:
@@ -64,7 +64,7 @@ class _Plan:
 
 
 def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str]:
-    """The layout with pinhole images in place of bent ones, and a line about that; empty where none are bent.
+    """The layout with pinhole images in place of bent ones, and a line about that; empty if none are bent.
 
     The pinhole camera has the focal lengths, the principal point and the size of the bent one: what lies beyond its
     borders is cut off, and pixels that the lens does not show are masked. Raises SceneError, also without OpenCV.
@@ -107,7 +107,7 @@ def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str
 
 
 def cache_folder(scene: str) -> str:
-    """Where undistorted images are kept: $DSMOE_CACHE, else a folder in the scene, else one of the user's cache."""
+    """The folder of undistorted images: $DSMOE_CACHE, else a folder in the scene, else one of the user's cache."""
     scene = os.path.abspath(scene)
     own = os.path.join(scene, CACHE_NAME)
     if not os.environ.get(CACHE_VARIABLE) and os.access(own if os.path.isdir(own) else scene, os.W_OK):
@@ -118,7 +118,7 @@ def cache_folder(scene: str) -> str:
 
 
 def _opencv() -> Any:
-    """The module cv2; None where it is not installed."""
+    """The module cv2; None if it is not installed."""
     try:
         import cv2
     except ImportError:
@@ -127,13 +127,13 @@ def _opencv() -> Any:
 
 
 def _plan(image: PosedImage, folder: str) -> _Plan:
-    """Reads the image and its mask, since size and time of a file may stay where its content changes."""
+    """Reads the image and its mask: a file may change and keep its size and time."""
     content = read_content(image.path)
     camera = image.camera.resized(*size_of(content, image.path))
     own = _checksum(content)
     own_mask = _checksum(read_content(image.mask)) if image.mask else ""
     pinhole = (VERSION, _intrinsics(camera), image.lens)
-    # Images of one camera share the mask, but where they have masks of their own.
+    # Images of one camera share the mask, unless they have masks of their own.
     return _Plan(image, camera, own, own_mask, os.path.join(folder, _name(*pinhole, own)),
                  os.path.join(folder, "mask-" + _name(*pinhole, own_mask)))
 

@@ -11,7 +11,7 @@ PR_SET_PDEATHSIG = 1  # of prctl(2)
 def die_with_parent(end: int = signal.SIGTERM) -> None:
     """Sends this process the signal `end` when the one that started it has ended, in whatever way (Linux).
 
-    For the new process itself: as the preexec_fn of subprocess, or first thing in its main. Where `end` has a handler,
+    For the new process itself: as the preexec_fn of subprocess, or first thing in its main. If `end` has a handler,
     that handles it.
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):

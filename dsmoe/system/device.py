@@ -1,4 +1,4 @@
-"""Where a command computes: the device that is asked for, or by itself the GPU where it can be used."""
+"""The device that a command computes on: the one that is asked for, or by itself the GPU if it can be used."""
 from __future__ import annotations
 
 import os
@@ -6,15 +6,15 @@ from typing import Optional
 
 import torch
 
-from ..config import DEVICES
+from ..choices import DEVICES
 from ..errors import TrainerError
 from .environment import extension_info, machine
 
-DEVICE_VARIABLE = "DSMOE_DEVICE"  # what `auto` means, where it is set
+DEVICE_VARIABLE = "DSMOE_DEVICE"  # what `auto` means, if it is set
 
 
 def check_device(device: str) -> None:
-    """Raises TrainerError where this machine or this build cannot train on the device."""
+    """Raises TrainerError if this machine or this build cannot train on the device."""
     if device == "cpu":
         return
     reason = why_no_gpu()
@@ -23,7 +23,7 @@ def check_device(device: str) -> None:
 
 
 def why_no_gpu() -> Optional[str]:
-    """Why this machine or this build cannot compute on a GPU; None where it can."""
+    """Why this machine or this build cannot compute on a GPU; None if it can."""
     if not torch.cuda.is_available():
         return "torch finds no CUDA device on this machine"
     info = extension_info()
@@ -34,9 +34,9 @@ def why_no_gpu() -> Optional[str]:
 
 
 def chosen_device(asked: Optional[str] = None) -> str:
-    """The device for --device: `auto`, which None is too, is $DSMOE_DEVICE, else the GPU where it can be used.
+    """The device for --device: `auto`, which None is too, is $DSMOE_DEVICE, else the GPU if it can be used.
 
-    Raises TrainerError where the device that is asked for is none, or cannot be used.
+    Raises TrainerError if the device that is asked for is none, or cannot be used.
     """
     device, source = asked or "auto", "--device"
     if device == "auto" and os.environ.get(DEVICE_VARIABLE):
@@ -50,7 +50,7 @@ def chosen_device(asked: Optional[str] = None) -> str:
 
 
 def device_to_train_on() -> str:
-    """`chosen_device()`, also where nothing is compiled yet: a build for the GPU that torch sees is then to come."""
+    """`chosen_device()`, also if nothing is compiled yet: a build for the GPU that torch sees is then to come."""
     try:
         return chosen_device()
     except ImportError:

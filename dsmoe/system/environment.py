@@ -37,14 +37,14 @@ def versions() -> Dict[str, str]:
 
 
 def extension_info() -> Dict[str, Any]:
-    """`build_info()` of the compiled extension. Raises ImportError where it is not built."""
+    """`build_info()` of the compiled extension. Raises ImportError if it is not built."""
     from diff_smoe_rasterization import build_info
 
     return dict(build_info())
 
 
 def describe() -> str:
-    """What `dsmoe info` prints; says what is missing where the extension is not usable."""
+    """What `dsmoe info` prints; says what is missing if the extension is not usable."""
     lines = {**versions(), "processor": f"{processor_name()}, {os.cpu_count()} cores"}
     try:
         info = extension_info()

@@ -15,12 +15,12 @@ PART = ".dsmoe_part-"  # begins the name of a file that is not whole yet; the nu
 
 
 def is_file(path: str) -> bool:
-    """Whether a file is there. Raises TrainerError where that cannot be seen, as in a folder that must not be read."""
+    """Whether a file is there. Raises TrainerError if that cannot be seen, as in a folder that must not be read."""
     return stat.S_ISREG(_mode(path))
 
 
 def is_folder(path: str) -> bool:
-    """Whether a folder is there. Raises TrainerError where that cannot be seen."""
+    """Whether a folder is there. Raises TrainerError if that cannot be seen."""
     return stat.S_ISDIR(_mode(path))
 
 
@@ -34,7 +34,7 @@ def _mode(path: str) -> int:
 
 
 class _PatientFile:
-    """A file that notes its first error instead of raising: torch 1.13 ends the process where a write raises."""
+    """A file that notes its first error instead of raising: torch 1.13 ends the process if a write raises."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file = file
@@ -75,7 +75,7 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
     """Gives the name of a file to write beside `path`, with its ending; without an error it becomes `path`.
 
     No two processes get the same name. What a killed process left is removed. Raises OSError, which names `path`, and
-    TrainerError as `check_output`, also where the file has come meanwhile.
+    TrainerError as `check_output`, also if the file has come meanwhile.
     """
     check_output(path, overwrite)
     folder, name = os.path.split(os.path.abspath(path))
@@ -122,7 +122,7 @@ def _runs(number: int) -> bool:
 def write_atomically(path: str, write: Callable[[Any], None], overwrite: bool = True) -> None:
     """Calls `write` with an object that has `write` and `flush`; what it is given becomes `path` once it is complete.
 
-    Where that fails, an earlier `path` stays as it was. Raises OSError, which names `path`, and TrainerError as
+    If that fails, an earlier `path` stays as it was. Raises OSError, which names `path`, and TrainerError as
     `check_output`.
     """
     try:

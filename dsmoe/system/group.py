@@ -131,7 +131,7 @@ class DistributedGroup(Group):
 def launched_by_torchrun() -> bool:
     """Whether torchrun started this process, even if it is the only one.
 
-    Raises TrainerError where its variables are there in part, or say what cannot be.
+    Raises TrainerError if its variables are there in part, or say what cannot be.
     """
     there = [name for name in OF_A_PROCESS if name in os.environ]
     if not there:  # MASTER_ADDR and MASTER_PORT may be set for all programs of a machine
@@ -160,7 +160,7 @@ def _number(name: str, least: int, most: int, why: str = "") -> int:
 def join_group(device: str) -> Group:
     """The group of this process, which torchrun has started or nobody; on CUDA each takes the GPU of its local rank.
 
-    Raises TrainerError where the host has fewer GPUs than torchrun has started processes there, and where the
+    Raises TrainerError if the host has fewer GPUs than torchrun has started processes there, and if the
     processes do not meet.
     """
     if not launched_by_torchrun():

@@ -32,7 +32,7 @@ class Record(NamedTuple):
 
 
 def make_folder(path: str) -> None:
-    """Makes a folder where it is not there. Raises TrainerError where nothing can be written in it."""
+    """Makes a folder if it is not there. Raises TrainerError if nothing can be written in it."""
     reason = ""
     try:
         os.makedirs(path, exist_ok=True)
@@ -43,7 +43,7 @@ def make_folder(path: str) -> None:
 
 
 def locked(path: str, shared: bool = False) -> IO[str]:
-    """The file, open and locked: exclusively, or shared with other processes. Raises TrainerError where it is taken.
+    """The file, open and locked: exclusively, or shared with other processes. Raises TrainerError if it is taken.
 
     A file system that knows no locks keeps nobody away.
     """
@@ -73,7 +73,7 @@ def only_one(folder: str) -> Iterator[IO[str]]:
 
 
 def check_there(folder: str, lock: IO[str]) -> None:
-    """Raises TrainerError where the folder is no longer the one whose lock is held: moved, removed or replaced."""
+    """Raises TrainerError if the folder is no longer the one whose lock is held: moved, removed or replaced."""
     path = os.path.join(folder, LOCK_NAME)
     try:
         if os.path.samestat(os.stat(path), os.fstat(lock.fileno())):
@@ -92,9 +92,9 @@ def check_there(folder: str, lock: IO[str]) -> None:
 
 
 def read_record(folder: str, command: str) -> Optional[Record]:
-    """What the command recorded in the folder; None where there is no record.
+    """What the command recorded in the folder; None if there is no record.
 
-    Raises TrainerError where it is another command's, or damaged, or names a file to which a link leads.
+    Raises TrainerError if it is another command's, or damaged, or names a file to which a link leads.
     """
     path = os.path.join(folder, RECORD_NAME)
     if not is_file(path):
@@ -118,7 +118,7 @@ def read_record(folder: str, command: str) -> Optional[Record]:
 
 
 def check_inside(folder: str, names: Collection[str]) -> None:
-    """Raises TrainerError where a link lies on the way from the folder to one of its files."""
+    """Raises TrainerError if a link lies on the way from the folder to one of its files."""
     for parent in sorted({os.path.dirname(name) for name in names}):
         path = os.path.join(folder, parent)
         real = os.path.realpath(path)
@@ -128,10 +128,10 @@ def check_inside(folder: str, names: Collection[str]) -> None:
 
 
 def own_record(folder: str, command: str, overwrite: bool = False, folders: Collection[str] = ()) -> Record:
-    """What the command recorded in the folder; an empty record where there is no folder, or nothing in it.
+    """What the command recorded in the folder; an empty record if there is no folder, or nothing in it.
 
-    overwrite: other things may be in it. folders: those in it that the command writes into. Raises TrainerError where
-    something is in it that the command has not recorded as its own, and where a link stands for one of the folders.
+    overwrite: other things may be in it. folders: those in it that the command writes into. Raises TrainerError if
+    something is in it that the command has not recorded as its own, and if a link stands for one of the folders.
     """
     record = read_record(folder, command)
     check_inside(folder, [os.path.join(name, "a") for name in folders])
@@ -141,7 +141,7 @@ def own_record(folder: str, command: str, overwrite: bool = False, folders: Coll
 
 
 def refuse_others(folder: str, command: str, remedy: str = "") -> None:
-    """Raises TrainerError where something is in a folder without a record: the command has not written it.
+    """Raises TrainerError if something is in a folder without a record: the command has not written it.
 
     A lock, or what a killed process has left of a file, is no such thing. remedy: another one, for that error.
     """
@@ -155,8 +155,8 @@ def refuse_others(folder: str, command: str, remedy: str = "") -> None:
 def write_record(folder: str, command: str, record: Record, earlier: Collection[str], overwrite: bool = False) -> None:
     """Records what is about to be written, and removes what of `earlier` is not.
 
-    earlier: files that the command has written before. Raises TrainerError where another file is in the way, which
-    `overwrite` lets be replaced, and where what is there is no regular file.
+    earlier: files that the command has written before. Raises TrainerError if another file is in the way, which
+    `overwrite` lets be replaced, and if what is there is no regular file.
     """
     check_inside(folder, record.files)
     for name in record.files:
@@ -173,7 +173,7 @@ def write_record(folder: str, command: str, record: Record, earlier: Collection[
 def remove_files(folder: str, names: Collection[str]) -> None:
     """Removes regular files of the folder that are there, and folders in it that are empty then; links stay.
 
-    Raises TrainerError, and removes nothing, where a link leads to one of them.
+    Raises TrainerError, and removes nothing, if a link leads to one of them.
     """
     check_inside(folder, names)
     for name in names:

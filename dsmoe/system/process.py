@@ -49,9 +49,9 @@ def _typed(script: str) -> str:
 
 
 def return_spare_memory(device: torch.device) -> None:
-    """Returns the GPU memory that torch keeps for later to the driver, where that is much.
+    """Returns the GPU memory that torch keeps for later to the driver, if that is much.
 
-    To be called where all arrays have changed their sizes: blocks of the sizes before seldom fit again, and torch would
+    To be called when all arrays have changed their sizes: blocks of the sizes before seldom fit again, and torch would
     keep them until the card is full. It costs time, so it waits until much has gathered.
     """
     if device.type != "cuda":
@@ -64,7 +64,7 @@ def return_spare_memory(device: torch.device) -> None:
 def keep_freed_memory() -> None:
     """Tells glibc to reuse freed memory instead of returning it to the system after every operation.
 
-    A step frees and allocates the same tensors again, and fresh pages cost time. Does nothing where the C library is
+    A step frees and allocates the same tensors again, and fresh pages cost time. Does nothing if the C library is
     another one.
     """
     try:

@@ -16,7 +16,7 @@ GPUS, AUTO = "--gpus", "auto"
 def chosen_gpus(asked: str, device: str, batch: int) -> int:
     """How many GPUs of this machine a training takes. asked: a number, or `auto`: all, but no more than --batch.
 
-    Raises ConfigError where it cannot take so many.
+    Raises ConfigError if it cannot take so many.
     """
     import torch
 
@@ -56,7 +56,7 @@ def torchrun_command(gpus: int, words: Sequence[str]) -> List[str]:
 def launch(gpus: int, words: Sequence[str]) -> int:
     """Runs the command in so many processes; returns torchrun's exit status once all have ended.
 
-    Where this process is killed, torchrun gets a SIGTERM, which it passes on: the processes save a checkpoint and end.
+    If this process is killed, torchrun gets a SIGTERM, which it passes on: the processes save a checkpoint and end.
     """
     package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)

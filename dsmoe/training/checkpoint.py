@@ -13,10 +13,10 @@ from ..config import CHECKPOINT_NAME, TrainConfig
 from ..errors import TrainerError, out_of_memory
 from ..model import GaussianModel
 from ..system.files import write_atomically
-from .background_gate import LearnedGate
+from .gate import LearnedGate
 from .state_check import Misfit, check_model, check_numbers
 
-TENSOR = "__tensor__"  # marks where a tensor was
+TENSOR = "__tensor__"  # stands for a tensor
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
 FORMAT = 6  # raised when the content changes so that older files cannot be resumed
@@ -33,7 +33,7 @@ class SoFar(NamedTuple):
 
 
 def made_so_far(config: TrainConfig, device: str) -> SoFar:
-    """Reads the checkpoint of the run that config is of. Raises TrainerError, also where it is another run's."""
+    """Reads the checkpoint of the run that config is of. Raises TrainerError, also if it is another run's."""
     path = os.path.join(config.output, CHECKPOINT_NAME)
     state = load_checkpoint(path, device)
     with damage_named(path):
@@ -52,7 +52,7 @@ def made_so_far(config: TrainConfig, device: str) -> SoFar:
         elif state["gate"] is None:
             gate = float(config.background_gate)
         else:
-            learned = LearnedGate(config, device)
+            learned = LearnedGate(config.gate, config.batch, device)
             learned.load_state_dict(state["gate"])
             gate = float(learned.value)
         return SoFar(path, model, gate, int(state["iteration"]), float(state["train_seconds"]))

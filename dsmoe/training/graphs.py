@@ -87,7 +87,7 @@ class NoGraphs:
         return None
 
     def find(self, memory: Sequence[Any], kind: Hashable, capture: Callable[[Captured], None]) -> Optional[Captured]:
-        """The step of this kind, captured now if need be; None where it has to be launched.
+        """The step of this kind, captured now if need be; None if it has to be launched.
 
         memory: all whose tensors a step reads or writes where they lie. capture: captures a step.
         """
@@ -130,7 +130,7 @@ class Graphs(NoGraphs):
         return found
 
     def _capture(self, num_gaussians: int, capture: Callable[[Captured], None]) -> Optional[Captured]:
-        """A new step; None where the memory does not suffice, also when all other graphs are gone."""
+        """A new step; None if the memory does not suffice, also when all other graphs are gone."""
         if num_gaussians >= self._too_many:
             return None
         for _ in range(2):
@@ -183,7 +183,7 @@ class CudaGraphs(Graphs):
         self._device = device
         self._stream = torch.cuda.Stream(device)
         self._pool: Any = None
-        self._keeper: Any = None  # a graph that keeps the pool where all others are gone
+        self._keeper: Any = None  # a graph that keeps the pool if all others are gone
         self._room = 0.0  # Gaussians that the pool has memory for
         self._bytes = 0.0  # that the graphs take for each Gaussian
         self._reserve = 0  # bytes that the pool began with

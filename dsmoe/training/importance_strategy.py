@@ -15,7 +15,7 @@ import torch
 from ..errors import ConfigError
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
-from .drawing import draw
+from .randomness import draw
 from .strategy import Look, SteadyStrategy, Step, StrategyContext, is_due
 
 # Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, sixteen removals are at 8,200 to 13,825,
@@ -28,7 +28,7 @@ MOVE_INTERVAL = 1 / 30
 # The average begins behind 21,000. Between two of its terms are so many steps, fewer in the shortest runs.
 AVERAGE_BEGINS = 7 / 5
 MOST_BETWEEN_TERMS = 10
-TERMS = 100  # in densify_until_iter, at least, where that has so many steps
+TERMS = 100  # in densify_until_iter, at least, if that has so many steps
 
 # A view needs a Gaussian if its removal costs more than this there: squared colours, summed over pixels.
 NEEDED_COST = 1e-3
@@ -36,7 +36,7 @@ NEEDED_COST = 1e-3
 NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
 NUMBERS_AT_ONCE = 2 ** 22  # coordinates of Gaussians, each seen from every camera: 16 MB of them are in memory
 
-# Growth beyond this many, or beyond twice the budget where that is more, would cost time and memory: no budget above
+# Growth beyond this many, or beyond twice the budget if that is more, would cost time and memory: no budget above
 # 200,000 was tried with more.
 MOST_OVERSHOOT = 2_000_000
 
@@ -74,7 +74,7 @@ class ImportanceStrategy(SteadyStrategy):
         self._check_reach()
 
     def _check_reach(self) -> None:
-        """Raises ConfigError where growth cannot lead to the budget: a densification doubles at most."""
+        """Raises ConfigError if growth cannot lead to the budget: a densification doubles at most."""
         config = self.context.config
         most = self.start * 2**self._densifications(config.densify_from_iter)
         if most < config.budget:
@@ -155,7 +155,7 @@ class ImportanceStrategy(SteadyStrategy):
         return least, -(-max(0, self.overshoot() - now) // steps)
 
     def overshoot(self) -> int:
-        """How many Gaussians growth leads to, where the gradients suffice."""
+        """How many Gaussians growth leads to, if the gradients suffice."""
         budget = self.context.config.budget
         wanted = round(self.options.overshoot * budget)
         return max(min(wanted, max(2 * budget, MOST_OVERSHOOT)), 2 * self.start)
@@ -267,7 +267,7 @@ class ImportanceStrategy(SteadyStrategy):
     def _forget_looks(self) -> None:
         """Begins new sums, [N], for the next decision, which looks at a view of each group of neighbours."""
         self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
-        self.errors = torch.zeros_like(self.view_count)  # their squared error where the Gaussian is, by its share
+        self.errors = torch.zeros_like(self.view_count)  # the squared error of its pixels, by its share
         self.needed = torch.zeros_like(self.view_count)  # how many of the views need the Gaussian
         views = self.context.views
         count = self.looks

@@ -12,14 +12,14 @@ import torch
 from diff_smoe_rasterization.gaussians import divided
 
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
-from .drawing import draw
+from .randomness import draw
 from .strategy import Step, Strategy, StrategyContext
 
 DEAD_OPACITY = 0.005  # fainter Gaussians are relocated
 START_OPACITY, START_SCALE = 0.5, 0.1  # of the first Gaussians; the scale is a part of that of 3DGS
 OPACITY_WEIGHT = SCALE_WEIGHT = 0.01  # lambda_o and lambda_Sigma of the loss
 NOISE_RATE = 5e5  # lambda_noise
-NOISE_STEEPNESS = 100.0  # k: Gaussians are moved by the noise where they are faint
+NOISE_STEEPNESS = 100.0  # k: Gaussians are moved by the noise if they are faint
 GROWTH = 0.05  # of the Gaussians, at each step of growth
 GROWTH_ENDS = 5 / 3  # of densify_until_iter: 25,000
 
@@ -87,7 +87,7 @@ class MCMCStrategy(Strategy):
         return {name: raw[name].detach().index_select(0, drawn) for name in PARAMETERS}
 
     def shake(self) -> None:
-        """Adds noise to the positions, in the shape of each Gaussian and where it is faint (Eq. 8)."""
+        """Adds noise to the positions, in the shape of each Gaussian, if it is faint (Eq. 8)."""
         opacities, scales, rotations = self.context.model.activated()
         means = self.context.model.stored["means3D"]
         axes = rotation_matrices(rotations) * scales.unsqueeze(1)

@@ -1,6 +1,6 @@
 """How a step comes from its views to gradients and to the next parameters, in three kinds with the same numbers.
 
-`AutogradPasses` takes any rasterizer. `DirectPasses` is for a GPU, where a step is bound by memory traffic and by
+`AutogradPasses` takes any rasterizer. `DirectPasses` is for a GPU, on which a step is bound by memory traffic and by
 Python: it steps spherical harmonics lazily, makes one pass of activations and Adam, writes no gradient of what was not
 seen, and repeats steps as CUDA graphs. `BatchPasses`, in distributed/passes.py, do the same without graphs, for several
 views and processes.
@@ -25,7 +25,7 @@ from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer, package_rasterizer
 from ..scenes.cameras import Camera
 from ..scenes.images import View
-from .background_gate import LearnedGate
+from .gate import LearnedGate
 from .graphs import Captured, Graphs, NoGraphs
 from .strategy import Look, Step, ViewStep, look_at
 
@@ -50,7 +50,7 @@ class Passes:
 
     def __init__(self, model: GaussianModel, optimizer: GaussianOptimizer, renderer: Renderer,
                  gate: Optional[LearnedGate] = None) -> None:
-        """gate: the background's, where it is learned."""
+        """gate: the background's, if it is learned."""
         self.model, self.optimizer, self.renderer, self.gate = model, optimizer, renderer, gate
 
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()) -> Step:
@@ -100,7 +100,7 @@ class AutogradPasses(Passes):
 
     def _draw(self, camera: Camera, background: Optional[torch.Tensor]
               ) -> Tuple[Rendering, torch.Tensor, Callable[[], Splats]]:
-        """The image, a tensor [N, 3] whose .grad `backward` sets where radii > 0, and what the image says of each.
+        """The image, a tensor [N, 3] whose .grad `backward` sets if radii > 0, and what the image says of each.
 
         background: in place of the renderer's.
         """
@@ -108,7 +108,7 @@ class AutogradPasses(Passes):
         gate = None
         if self.gate:
             gate = self.gate.value.clone().requires_grad_()
-            gate.grad = self.gate.gradient.zero_()  # to which autograd adds; 0 where a given rasterizer leaves it out
+            gate.grad = self.gate.gradient.zero_()  # to which autograd adds; 0 if a given rasterizer leaves it out
         view = (camera, background, gate)
         if self.renderer.rasterize is package_rasterizer():
             rendering, splats = self.renderer.with_splats(*view, means2D=means2D)
@@ -133,7 +133,7 @@ class _Drawn(NamedTuple):
 
 
 class DirectPasses(Passes):
-    """The same numbers in fewer passes over memory; as CUDA graphs where steps are alike.
+    """The same numbers in fewer passes over memory; as CUDA graphs if steps are alike.
 
     A step has three parts, whose launches read all that changes from step to step in memory of the device: `_numbers`
     and, in a graph, copies of the view. So hooks run between the parts, whether these are launched or replayed.
@@ -142,13 +142,13 @@ class DirectPasses(Passes):
     def __init__(self, model: GaussianModel, optimizer: GaussianOptimizer, renderer: Renderer,
                  gate: Optional[LearnedGate] = None, loss_rule: Callable[[int], Any] = lambda iteration: iteration,
                  graphs: Optional[Graphs] = None) -> None:
-        """loss_rule: `Strategy.loss_rule`. graphs: where steps are captured; None: they are not."""
+        """loss_rule: `Strategy.loss_rule`. graphs: capture the steps; None: they are not."""
         super().__init__(model, optimizer, renderer, gate)
         self._loss_rule, self._graphs = loss_rule, graphs or NoGraphs()
         self._values: List[torch.Tensor] = []  # what `activate` makes of the parameters
         self._made_of: List[Tuple[torch.Tensor, int]] = []  # these, and their versions at that time
         self._buffers: Dict[str, torch.Tensor] = {}  # gradients
-        self._captured: Optional[Captured] = None  # the step in progress, where it is
+        self._captured: Optional[Captured] = None  # the step in progress, if it is
         # How many steps harmonics may have missed, then the rates of geometry and of harmonics, as the ops take them.
         self._numbers = model.stored["means3D"].new_zeros(1 + 2 * len(PARAMETERS))
 
@@ -232,7 +232,7 @@ class DirectPasses(Passes):
         return {"means3D": stored["means3D"], **dict(zip(ACTIVATED, self._values)), **colors}
 
     def _buffers_of_gradients(self) -> Dict[str, torch.Tensor]:
-        """Where the gradients by `_gaussians` go."""
+        """The memory of the gradients by `_gaussians`."""
         lazy = self.model.lazy
         assert lazy is not None
         self._gradients = {name: self._buffer("d" + name, self.model.stored[name]) for name in GEOMETRY}
@@ -296,7 +296,7 @@ class DirectPasses(Passes):
                 for number in corrected_rates(self.optimizer.group(name), int(state["step"]) + ahead)]
 
     def _step_geometry(self, seen: torch.Tensor) -> None:
-        """By the rates in `_numbers`. seen: [N] int32 above 0 where there is a gradient."""
+        """By the rates in `_numbers`. seen: [N] int32 above 0 if there is a gradient."""
         raw, states = [self.model.stored[name] for name in GEOMETRY], self._states()
         group, zeros = self.optimizer.group("scales"), [0.0] * len(raw)
         _OPS.gaussian_adam(raw, self._values, [self._buffer("d" + name, self.model.stored[name]) for name in GEOMETRY],
@@ -311,7 +311,7 @@ class DirectPasses(Passes):
         lazy.launch_step(radii, self._numbers[:1], rates)
 
     def _step_some(self, same: Set[str]) -> None:
-        """Where an opacity reset has replaced a parameter: the others are stepped by the dense optimizer."""
+        """If an opacity reset has replaced a parameter: the others are stepped by the dense optimizer."""
         unseen = (self._stepped <= 0).unsqueeze(1)
         gradients = {name: gradient.masked_fill(unseen, 0) for name, gradient in self._gradients.items()}
         raw = _OPS.activate_backward([self.model.stored[name] for name in ACTIVATED], self._values,
@@ -322,7 +322,7 @@ class DirectPasses(Passes):
         self.optimizer.step()
 
     def _activate(self) -> None:
-        """Makes the values anew where something else than `update` has changed what they are made of."""
+        """Makes the values anew if something else than `update` has changed what they are made of."""
         raw = [self.model.stored[name] for name in ACTIVATED]
         if len(self._made_of) != len(raw) or any(tensor is not made_of or tensor._version != version
                                                  for tensor, (made_of, version) in zip(raw, self._made_of)):

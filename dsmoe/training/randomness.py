@@ -1,11 +1,15 @@
-"""Seeds of python, numpy and torch, and their generators' states for checkpoints."""
+"""All chance of a training: seeds and states of generators, the order of views, and rows drawn by weights."""
 from __future__ import annotations
 
 import random
-from typing import Any, Dict
+from typing import Any, Dict, List
 
 import numpy as np
 import torch
+
+from ..errors import TrainerError
+
+MOST_ROWS = 2 ** 24  # of which torch.multinomial draws
 
 
 def seed_everything(seed: int) -> None:
@@ -35,3 +39,48 @@ def restore_random_state(state: Dict[str, Any]) -> None:
     torch.set_rng_state(state["torch"].cpu())
     if state["cuda"] and torch.cuda.is_available():
         torch.cuda.set_rng_state_all([tensor.cpu() for tensor in state["cuda"]])
+
+
+class ViewOrder:
+    """The order in which training views are seen: random, without replacement, epoch after epoch.
+
+    It has a random generator of its own, so that nothing else shifts the order.
+    """
+
+    def __init__(self, count: int, seed: int) -> None:
+        self.count = count
+        self.random = random.Random(seed)
+        self.remaining: List[int] = []
+
+    def next(self) -> int:
+        """The next view; each is seen once before any is seen again."""
+        if not self.remaining:
+            self.remaining = list(range(self.count))
+            self.random.shuffle(self.remaining)
+        return self.remaining.pop()
+
+    def state_dict(self) -> Dict[str, Any]:
+        return {"left": list(self.remaining), "random": self.random.getstate()}
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        version, numbers, gauss = state["random"]
+        self.remaining = list(state["left"])
+        self.random.setstate((version, tuple(numbers), gauss))
+
+
+def draw(weights: torch.Tensor, count: int, replacement: bool = False) -> torch.Tensor:
+    """Returns rows [count], drawn by weights [N] of at least 0; without replacement count of them must be above 0.
+
+    Raises TrainerError for weights of which a training that goes on has none, such as NaN.
+    """
+    total = float(weights.sum())
+    if not 0 < total < float("inf"):
+        raise TrainerError(f"the training has diverged: the weights of its Gaussians sum to {total}; lower the "
+                           "learning rates")
+    if len(weights) <= MOST_ROWS:
+        return torch.multinomial(weights, count, replacement=replacement)
+    if not replacement:  # Efraimidis and Spirakis 2006: each row waits for a time of its rate; the first ones are drawn
+        return torch.topk(weights / torch.empty_like(weights).exponential_(), count).indices
+    sums = weights.double().cumsum(0)
+    places = torch.rand(count, dtype=sums.dtype, device=sums.device) * sums[-1]
+    return torch.searchsorted(sums, places, right=True)

@@ -15,13 +15,13 @@ class Route(NamedTuple):
 
 
 class Shards:
-    """All Gaussians are in this process. distributed/shards.py has what holds where there are several.
+    """All Gaussians are in this process. distributed/shards.py has what holds if there are several.
 
     The Gaussians have one order, that of one process; each has a run of it.
     """
 
     def total(self, count: int) -> int:
-        """How many Gaussians all processes have together, where this one has `count` and they are settled."""
+        """How many Gaussians all processes have together, if this one has `count` and they are settled."""
         return count
 
     def every(self, rows: torch.Tensor) -> torch.Tensor:

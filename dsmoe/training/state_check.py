@@ -23,7 +23,7 @@ class Misfit(ValueError):
 
 
 def check_state(state: Dict[str, Any], config: TrainConfig, strategy: Dict[str, Any], views: int) -> None:
-    """Raises Misfit where a state is none of the run with this config. What else may be raised means the same.
+    """Raises Misfit if a state is none of the run with this config. What else may be raised means the same.
 
     strategy: the state of the run's strategy as it is now. views: number of training views.
     """
@@ -83,7 +83,7 @@ def check_state(state: Dict[str, Any], config: TrainConfig, strategy: Dict[str, 
 
 
 def check_model(state: Dict[str, Any], config: TrainConfig) -> None:
-    """Raises Misfit where a state's Gaussians, or its background gate, are none of the run with this config."""
+    """Raises Misfit if a state's Gaussians, or its background gate, are none of the run with this config."""
     degree = state["active_sh_degree"]
     _require(_is_whole(degree) and 0 <= degree <= config.sh_degree, "active_sh_degree", degree,
              f"0 to {config.sh_degree}")
@@ -108,7 +108,7 @@ def check_model(state: Dict[str, Any], config: TrainConfig) -> None:
 
 
 def check_numbers(state: Dict[str, Any]) -> None:
-    """Raises Misfit where a tensor of a state holds what no training has that goes on: NaN, infinities, overflows."""
+    """Raises Misfit if a tensor of a state holds what no training has that goes on: NaN, infinities, overflows."""
     for name, tensor in _tensors(state, CHANGING):
         where, _, last = name.rpartition("/")
         fits, wanted = are_numbers(last, tensor) if where in ("raw", "average") else tensor.isfinite(), "finite"

@@ -1,4 +1,4 @@
-"""Where Gaussians are added and removed: one small interface, and the recipe of 3DGS behind it.
+"""How Gaussians are added and removed: one small interface, and the recipe of 3DGS behind it.
 
 A new strategy is one class with the hooks below and one line in strategies.py. What it may need of the run, extra
 renderings of training views included, is in StrategyContext.
@@ -34,7 +34,7 @@ class Look(NamedTuple):
     """What one view says of each Gaussian's worth: sums over its pixels of squared colours."""
 
     costs: torch.Tensor  # [N] how much the image changes on the removal of the Gaussian
-    errors: torch.Tensor  # [N] the error of the image where the Gaussian is, by its share
+    errors: torch.Tensor  # [N] the error of its pixels, by its share
 
 
 def look_at(view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> Look:
@@ -66,7 +66,7 @@ class StrategyContext:
 
 
 Seen = Tuple[torch.Tensor, torch.Tensor]
-"""Of one view dL/dpixel times (0.5 W, 0.5 H), [N, 3], where radii > 0, and these radii [N] int32."""
+"""Of one view dL/dpixel times (0.5 W, 0.5 H), [N, 3], if radii > 0, and these radii [N] int32."""
 
 
 def is_due(iteration: int, interval: int, batch: int = 1) -> bool:
@@ -182,7 +182,7 @@ class ThreeDGSStrategy(Strategy):
             kept = self.prune(large_too=self.prunes_large and step.iteration > config.opacity_reset_interval)
             self.context.shards.settle(kinds[kept])
             self._forget_statistics()
-        # On white, 3DGS resets once more where densification starts.
+        # On white, 3DGS resets once more when densification starts.
         starts_on_white = config.white_background and step.reaches(config.densify_from_iter)
         if self.resets_opacity and (step.due(config.opacity_reset_interval) or starts_on_white):
             self.reset_opacities()
@@ -200,7 +200,7 @@ class ThreeDGSStrategy(Strategy):
     def densify(self, gradients: torch.Tensor, least: int = 0, most: Optional[int] = None) -> torch.Tensor:
         """Clones small and splits large Gaussians whose mean gradient [N] reaches the threshold.
 
-        Where those are fewer than `least` or more than `most`, so many of the largest gradients are taken. Returns the
+        If those are fewer than `least` or more than `most`, so many of the largest gradients are taken. Returns the
         kinds of all Gaussians now, [N] int64: 0 for the old ones, 1 for clones, from 2 on the children of splits.
         """
         config, model = self.context.config, self.context.model
@@ -265,7 +265,7 @@ class ThreeDGSStrategy(Strategy):
             add_view(gradients, radii, self.gradient_sum, self.view_count)
 
     def _mean_gradients(self) -> torch.Tensor:
-        """[N] over the views that saw each Gaussian since the last densification; 0 where none did."""
+        """[N] over the views that saw each Gaussian since the last densification; 0 if none did."""
         return self.gradient_sum / self.view_count.clamp(min=1)
 
     def _forget_statistics(self) -> None:

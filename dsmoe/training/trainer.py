@@ -18,11 +18,10 @@ from ..scenes.images import View
 from ..scenes.scene import Scene, difference_of, scene_fingerprint
 from ..system.group import ALONE
 from ..system.stopwatch import Stopwatch
-from .background_gate import LearnedGate
+from .gate import LearnedGate
 from .graphs import CudaGraphs
-from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses, Passes, ViewOver
-from .randomness import random_state, restore_random_state, seed_everything
+from .randomness import ViewOrder, random_state, restore_random_state, seed_everything
 from .shards import Shards
 from .state_check import check_state
 from .strategies import STRATEGIES
@@ -44,7 +43,7 @@ class Trainer:
         self.shards = self._make_shards()
         background = background_color(config.white_background, config.device)
         learned = config.background_gate == LEARNED
-        self.gate = LearnedGate(config, config.device) if learned else None
+        self.gate = LearnedGate(config.gate, config.batch, config.device) if learned else None
         self.renderer = Renderer(
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),
@@ -86,7 +85,7 @@ class Trainer:
 
     @property
     def checkpoint_device(self) -> str:
-        """Where a checkpoint is read to."""
+        """The device that a checkpoint is read to."""
         return self.config.device
 
     @property
@@ -95,11 +94,11 @@ class Trainer:
         return self.model.num_gaussians
 
     def whole_model(self) -> Optional[GaussianModel]:
-        """The model with the Gaussians of all processes, averaged if the strategy does so, where this one leads."""
+        """In the process that leads the model with the Gaussians of all, averaged if the strategy does so."""
         return self.result().model
 
     def result(self) -> Renderer:
-        """Renders what the run has found so far: the average of the parameters, where one is kept."""
+        """Renders what the run has found so far: the average of the parameters, if one is kept."""
         average = self.optimizer.average
         if not average:
             return self.renderer
@@ -160,7 +159,7 @@ class Trainer:
                                "try another --densify-grad-threshold or --strategy steady")
 
     def target_of(self, view: View, color: Optional[torch.Tensor]) -> torch.Tensor:
-        """What a rendering is compared with. color: [3] the background, where it is of this step alone."""
+        """What a rendering is compared with. color: [3] the background, if it is of this step alone."""
         return view.image if color is None or view.opacity is None else view.image_over(
             color, self.renderer.background)
 
@@ -180,7 +179,7 @@ class Trainer:
 
     @property
     def background_gate(self) -> float:
-        """The gate that the run has found so far; where it is learned, the host waits for the device."""
+        """The gate that the run has found so far; if it is learned, the host waits for the device."""
         return float(self.optimizer.average.get("background_gate", self.renderer.background_gate))
 
     def evaluate(self, progress: bool = False) -> Evaluation:
@@ -205,7 +204,7 @@ class Trainer:
         }
 
     def check_state(self, state: Dict[str, Any]) -> None:
-        """Raises TrainerError where a state is another run's, Misfit and others where it can be none's."""
+        """Raises TrainerError if a state is another run's, Misfit and others if it can be none's."""
         differences = TrainConfig.of_record(state["config"]).differences(self.config)
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))

@@ -26,7 +26,7 @@ class Followed:
 
     def __init__(self, source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
                  device: str = "cpu", **options: Any) -> None:
-        """Arguments as in `open_trained`. Raises TrainerError, also where a run has no checkpoint yet."""
+        """Arguments as in `open_trained`. Raises TrainerError, also if a run has no checkpoint yet."""
         self._arguments = (source, blend_mode, background_gate, device)
         self._options = options
         self._config: Optional[TrainConfig] = None  # of the run that is shown
@@ -41,7 +41,7 @@ class Followed:
     def poll(self) -> bool:
         """Looks for a newer checkpoint, the end, or another run in the folder; returns whether there is one.
 
-        What was shown stays where this raises: TrainerError, or what a file that is being replaced causes.
+        What was shown stays if this raises: TrainerError, or what a file that is being replaced causes.
         """
         if not self._is_run:
             return False

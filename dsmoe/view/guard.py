@@ -19,7 +19,7 @@ Takes = Callable[[str, Any], bool]
 
 
 def refusal(origin: Optional[str], host: Optional[str], served_at: str) -> Optional[str]:
-    """Why a request is not answered; None where it is.
+    """Why a request is not answered; None if it is.
 
     origin: the header by which a browser says whose page asks; other programs send none. host: the header that says
     what the browser takes this server for. A page of another site may name itself as the host once its name leads here
@@ -81,7 +81,7 @@ def only_own_pages(served_at: str, takes: Takes) -> Iterator[None]:
     Messages that are not wanted are dropped. A browser whose message viser cannot read all the same is left, and a line
     says so. viser checks nothing and has no option for it. So the function by which it
     starts its server is replaced meanwhile.
-    Raises TrainerError where this release of viser starts it in another way.
+    Raises TrainerError if this release of viser starts it in another way.
     """
     import viser
 

@@ -77,7 +77,7 @@ def _of_blend(renderer: Renderer, camera: Camera, blend: Blend, shown: str) -> n
 
 
 def _gate_map(renderer: Renderer, camera: Camera) -> torch.Tensor:
-    """[3, H, W] the colour of the Gaussian with the largest gate, and the background where none is open."""
+    """[3, H, W] the colour of the Gaussian with the largest gate, and the background if none is open."""
     _, splats = renderer.with_splats(camera)
     colours = torch.cat([own_colours(renderer.model.num_gaussians).to(renderer.background),
                          renderer.background[None]])
@@ -92,7 +92,7 @@ def own_colours(count: int) -> torch.Tensor:
 
 
 def near_is_bright(depth: torch.Tensor) -> torch.Tensor:
-    """Grey of depths [1, H, W]: 1 at the nearest percent, falling to 0.1 at the farthest, and 0 where nothing is."""
+    """Grey of depths [1, H, W]: 1 at the nearest percent, falling to 0.1 at the farthest, and 0 if nothing is."""
     hit = depth > 0
     if not hit.any():
         return torch.zeros_like(depth)

@@ -1,6 +1,6 @@
 """The viewer's server: viser moves the camera in the browser, and each picture is rendered here.
 
-Whatever a browser sends may be wrong, and viser passes it on. So numbers are clamped where they are read (`Controls`,
+Whatever a browser sends may be wrong, and viser passes it on. So numbers are clamped as they are read (`Controls`,
 `camera_of`), and what still fails for one browser is said in its panel, while the others go on.
 """
 from __future__ import annotations
@@ -71,13 +71,13 @@ class Controls:
     def take(self, uuid: str, value: Any) -> bool:
         """Whether the control that viser knows by `uuid` takes a browser's value: a text or a number, as it has one.
 
-        viser makes the one of the other, and fails where a text is no number.
+        viser makes the one of the other, and fails if a text is no number.
         """
         return any(control._impl.uuid == uuid and isinstance(value, str) == isinstance(control.value, str)
                    for control in self._all)
 
     def follow(self, before: Blend, after: Blend) -> None:
-        """Takes the background gate that a training has learned meanwhile, where nobody has set another."""
+        """Takes the background gate that a training has learned meanwhile, if nobody has set another."""
         for gate in (self.gate, self.other_gate):
             if gate.value == before.background_gate:
                 gate.value = after.background_gate
@@ -106,7 +106,7 @@ class Viewer:
     """Shows a model to any number of browsers; one thread renders."""
 
     def __init__(self, followed: Followed, host: str = VIEW_HOST, port: int = VIEW_PORT) -> None:
-        """Starts the server; where the port is taken, it takes the next free one. Raises TrainerError without viser."""
+        """Starts the server; if the port is taken, it takes the next free one. Raises TrainerError without viser."""
         if not 0 <= port < 2**16:
             raise TrainerError(f"--port is {port}; it must be between 0 and {2**16 - 1}")
         try:
@@ -154,7 +154,7 @@ class Viewer:
             raise self._error
 
     def _first_view(self) -> Tuple[float, np.ndarray, np.ndarray]:
-        """Where it begins: the vertical field of view in radians, the camera's place [3], and what it looks at [3]."""
+        """The first view: the vertical field of view in radians, the camera's place [3], and what it looks at [3]."""
         first, orbit = self.followed.cameras[0], self.followed.orbit
         forward = first.rotation[2]
         distance = max(float(forward @ (orbit.target - first.center)), 0.1)
@@ -208,7 +208,7 @@ class Viewer:
             changed = self.followed.poll()
             if changed:
                 self.controls.follow(before, Blend.of(self.followed.renderer))
-        except Exception as error:  # as where the run is being replaced: what was there stays in sight
+        except Exception as error:  # such as of a run that is being replaced: what was there stays in sight
             trouble = str(error) if isinstance(error, TrainerError) else _said_of(error)
         if changed or trouble != self._trouble:
             self._trouble = trouble

@@ -25,9 +25,10 @@ template <class S> struct BruteForce {
   int64_t num_pairs = 0;                            // that count
   std::vector<Contribution<double>> contributions;  // of each Gaussian, under brute_force_pixel_weight
   // Of each pixel: the Gaussian of the greatest weight, or -1; how far, relatively, the second greatest is below it;
-  // and how many pairs contribute.
-  std::vector<int32_t> greatest, num_contributing;
-  std::vector<double> lead;
+  // and how many pairs contribute. The Gaussian with which the weights reach half of the denominator, or -1; and how
+  // near, relatively, a sum of weights came to that half.
+  std::vector<int32_t> greatest, num_contributing, medians;
+  std::vector<double> lead, median_margin;
 
   double smallest_margin() const { return *std::min_element(margin.begin(), margin.end()); }
 };
@@ -54,8 +55,10 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
   for (int64_t i = 0; i < scene.count; ++i) {
     if (out.radii[i] > 0) order.push_back(i);
   }
-  std::stable_sort(order.begin(), order.end(),
-                   [&](int64_t a, int64_t b) { return projected[a].depth < projected[b].depth; });
+  if (Blend<kMode>::kNeedsDepthOrder) {
+    std::stable_sort(order.begin(), order.end(),
+                     [&](int64_t a, int64_t b) { return projected[a].depth < projected[b].depth; });
+  }
 
   const int64_t pixels = scene.pixels();
   out.color.resize(pixels * config.num_channels);
@@ -67,6 +70,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     double margin = std::numeric_limits<double>::infinity();
     int32_t greatest = -1, num_contributing = 0;
     double greatest_weight = 0, second_weight = 0;
+    std::vector<std::pair<int32_t, double>> weights;  // of the pairs that contribute
     auto decide = [&](double value, double threshold) { margin = std::min(margin, std::abs(value / threshold - 1)); };
     // Calls body(i, dx, dy, power, gate) for each Gaussian of the pixel, front to back. near: only near pairs count.
     const auto for_each_pair = [&](bool near, auto body) {
@@ -121,6 +125,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       const auto pair = Blend<kMode>::accumulate(state, gate);
       add_pair<double>(out.contributions[i], pair.contributes, brute_force_pixel_weight<S>(pixel), pair.weight, dx, dy);
       num_contributing += pair.contributes;
+      if (pair.contributes) weights.push_back({static_cast<int32_t>(i), pair.weight});
       if (pair.contributes && pair.weight > greatest_weight) {
         greatest = static_cast<int32_t>(i);
         second_weight = std::exchange(greatest_weight, double(pair.weight));
@@ -137,6 +142,16 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     auto end = state.end(config.blend.lambda());
     end.tails = tails;
     out.gate_sum[pixel] = finish_alpha<kMode>(end);
+    const double half = feature_end<kMode>(FeatureRule::kBlended, end).denominator / 2;
+    double sum = 0, median_margin = std::numeric_limits<double>::infinity();
+    int32_t median = -1;
+    for (const auto& [i, weight] : weights) {
+      sum += weight;
+      median_margin = std::min(median_margin, std::abs(sum / half - 1));
+      if (median < 0 && sum >= half) median = i;
+    }
+    out.medians.push_back(median);
+    out.median_margin.push_back(median_margin);
     int f = 0;
     for (; f < config.num_channels; ++f) {
       out.color[f * pixels + pixel] = finish_feature<kMode>(FeatureRule::kBlended, end, sums[f], config.background[f]);

@@ -1,4 +1,4 @@
-// The Gaussian of the greatest gate in each pixel, and the number of Gaussians there.
+// The Gaussian of the greatest gate in each pixel, the median one, and the number of Gaussians there.
 #include <gtest/gtest.h>
 
 #include <limits>
@@ -12,7 +12,7 @@ namespace dsmoe {
 namespace {
 
 struct Map {
-  std::vector<int32_t> gaussians, counts;
+  std::vector<int32_t> gaussians, counts, medians;
 };
 
 // Unwritten numbers are none that a map holds.
@@ -20,17 +20,19 @@ template <class S> Map map_of(const Scene<S>& scene, int num_threads = 1) {
   Rendering<S> rendering = render(scene);
   cpu::Frame<S> frame = frame_of(scene, rendering);
   frame.config.num_threads = num_threads;
-  Map map = {std::vector<int32_t>(scene.pixels(), -2), std::vector<int32_t>(scene.pixels(), -2)};
-  cpu::gate_map(frame, {map.gaussians.data(), map.counts.data()});
+  const std::vector<int32_t> unwritten(scene.pixels(), -2);
+  Map map = {unwritten, unwritten, unwritten};
+  cpu::gate_map(frame, {map.gaussians.data(), map.counts.data(), map.medians.data()});
   return map;
 }
 
-// A pixel is left out where rounding may turn a decision over, or exchange the two greatest gates.
+// A pixel is left out if rounding may turn a decision over, or exchange the two greatest gates; of the medians also one
+// in which a sum of weights is half up to rounding.
 template <class S> void expect_brute_force(const Scene<S>& scene) {
   const double least = 100 * std::numeric_limits<S>::epsilon();  // of weights: products of up to 80 rounded factors
   const BruteForce<S> expected = brute_force(scene);
   const Map actual = map_of(scene);
-  int64_t left_out = 0, num_pairs = 0, num_empty = 0;
+  int64_t left_out = 0, num_pairs = 0, num_empty = 0, num_medians = 0, no_medians = 0;
   for (int64_t pixel = 0; pixel < scene.pixels(); ++pixel) {
     if (expected.margin[pixel] < least || expected.lead[pixel] < least) {
       ++left_out;
@@ -40,10 +42,16 @@ template <class S> void expect_brute_force(const Scene<S>& scene) {
     ASSERT_EQ(actual.counts[pixel], expected.num_contributing[pixel]) << pixel;
     num_pairs += actual.counts[pixel];
     num_empty += actual.gaussians[pixel] < 0;
+    if (expected.median_margin[pixel] < least) continue;
+    ASSERT_EQ(actual.medians[pixel], expected.medians[pixel]) << pixel;
+    num_medians += actual.medians[pixel] >= 0;
+    no_medians += actual.medians[pixel] < 0 && actual.counts[pixel] > 0;
   }
   EXPECT_LE(left_out, scene.pixels() / 50);
   EXPECT_GT(num_pairs, 500);
   EXPECT_GT(num_empty, 0);
+  EXPECT_GT(num_medians, 50);
+  if (scene.config.blend.mode == BlendMode::kAlpha) EXPECT_GT(no_medians, 0);
 }
 
 template <class Mode> struct GateMapIn : testing::Test {};
@@ -82,6 +90,7 @@ TYPED_TEST(GateMapIn, DoesNotDependOnThreads) {
     const Map actual = map_of(scene, threads);
     EXPECT_EQ(actual.gaussians, expected.gaussians);
     EXPECT_EQ(actual.counts, expected.counts);
+    EXPECT_EQ(actual.medians, expected.medians);
   }
 }
 
@@ -91,6 +100,7 @@ TYPED_TEST(GateMapIn, IsEmptyWithoutGaussians) {
   const Map map = map_of(scene, 2);
   EXPECT_EQ(map.gaussians, std::vector<int32_t>(scene.pixels(), -1));
   EXPECT_EQ(map.counts, std::vector<int32_t>(scene.pixels(), 0));
+  EXPECT_EQ(map.medians, map.gaussians);
 }
 
 }  // namespace

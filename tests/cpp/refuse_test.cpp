@@ -148,7 +148,7 @@ TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
                                        {numbers.data(), integers.data(), numbers.data(), numbers.data()}};
   const ImportanceMap<float> worth = {
       numbers.data(), numbers.data(), numbers.data(), {numbers.data(), numbers.data(), numbers.data()}};
-  const GateMap gates = {integers.data(), integers.data()};
+  const GateMap gates = {integers.data(), integers.data(), integers.data()};
   bool visible[20];
   cpu::Heap heap;
   const auto forget = [](auto value, auto member) {
@@ -196,6 +196,8 @@ TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
        "cpu::importance: color is null; it must point to an array [C, H, W]"},
       {[&](Frame& f) { cpu::gate_map(f, forget(gates, &GateMap::counts)); },
        "cpu::gate_map: counts is null; it must point to an array [H, W]"},
+      {[&](Frame& f) { f.saved.gate_sum = nullptr, cpu::gate_map(f, gates); },
+       "cpu::gate_map: saved.gate_sum is null; it must point to an array [H, W]"},
       {[&](Frame& f) { f.inputs.means3D = nullptr, cpu::mark_visible(f, visible); },
        "cpu::mark_visible: means3D is null; it must point to an array [N, 3]"}};
   for (const auto& c : cases) {

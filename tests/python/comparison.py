@@ -14,7 +14,7 @@ from diff_smoe_rasterization.settings import leaves_out_faint, resolve_faint_bel
 
 @contextlib.contextmanager
 def one_thread():
-    """For the reference on small tensors, where more threads of torch only wait for each other."""
+    """For the reference on small tensors, on which more threads of torch only wait for each other."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -97,7 +97,7 @@ def threshold_margin(scene):
             if settings.alpha_min > 0:
                 distances.append(log_alpha - math.log(settings.alpha_min))
             if gate > 0:
-                # Where the opacity is so small that 3 sigma count, the cut is only on G.
+                # If the opacity is so small that 3 sigma count, the cut is only on G.
                 cut = math.log(float(gate) * reference.ALPHA_MIN)
                 distances.append(torch.maximum(log_alpha - cut, power - math.log(reference.KERNEL_KEPT)))
         counts = reference.pair_counts(splats, x, y, settings, mode, gate)
@@ -106,7 +106,7 @@ def threshold_margin(scene):
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
         if leaves_out_faint(mode, settings.faint_below):
             # A pair is near by its alpha, or by its kernel and a lower alpha. Near pairs stop early by themselves.
-            # They decide in the pixels that they cover, and in others where one pair more, of 1/255, could cover them.
+            # They decide in the pixels that they cover, and in others if one pair more, of 1/255, could cover them.
             near = reference.pair_alphas(splats, x, y, reference.near_pairs(splats, x, y, counts))
             in_core = torch.minimum(power - math.log(reference.KERNEL_KEPT), log_alpha - math.log(reference.CORE_MIN))
             by_near = [torch.maximum(log_alpha - math.log(reference.ALPHA_MIN), in_core),

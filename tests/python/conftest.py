@@ -1,6 +1,6 @@
 """Fixtures of all tests: the five blend modes, the devices, and an environment that selects no mode.
 
-A test that uses the fixture `device` runs once on the CPU and, where there is a GPU and a build for it, once there.
+A test that uses the fixture `device` runs once on the CPU and, if there is a GPU and a build for it, once there.
 """
 from __future__ import annotations
 

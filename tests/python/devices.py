@@ -7,7 +7,7 @@ import torch
 
 
 def without_cuda_because():
-    """Returns why nothing can be tested on a GPU here; None where it can."""
+    """Returns why nothing can be tested on a GPU here; None if it can."""
     try:
         from diff_smoe_rasterization.extension import BACKENDS, build_info
     except ImportError as error:

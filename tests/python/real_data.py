@@ -1,4 +1,4 @@
-"""Where the captures lie."""
+"""The folder of the captures."""
 from __future__ import annotations
 
 import os
@@ -7,7 +7,7 @@ import pytest
 
 
 def folder(name):
-    """Path of a data set; skips the test where it is absent."""
+    """Path of a data set; skips the test if it is absent."""
     root = os.path.join(os.path.dirname(__file__), "..", "..")
     data = os.environ.get("DSMOE_DATA") or os.path.join(root, "..", "shared", "data")
     path = os.path.abspath(os.path.join(data, name))

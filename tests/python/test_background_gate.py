@@ -67,7 +67,7 @@ def test_a_tensor_of_value_0_is_eq_7_and_has_a_gradient():
 
 
 def test_a_tensor_of_value_1_is_alpha_where_no_tile_ends(function):
-    """One tile; opacities above exp(4.5) / 255 = 0.353, where both cut at 1/255; no splat beyond the tile's edge."""
+    """One tile; opacities above exp(4.5) / 255 = 0.353, so that both cut at 1/255; no splat beyond the tile's edge."""
     alpha = random_scene("alpha", 80, 16, 16, opacity=(0.36, 0.98), degree=1, seed=5)
     inside = ((alpha.inputs["means3D"] @ alpha.settings.viewmatrix[:3, :2]).abs() < 1.5).all(1)
     alpha = alpha.rows(inside)
@@ -251,7 +251,7 @@ def test_dL_dlambda_equals_a_finite_difference(function, gate):
 
 
 def test_the_common_factor_of_all_opacities_has_a_gradient():
-    """Eq. 7 does not see it where opacities are small, which is why its Gaussians could not fade."""
+    """Eq. 7 does not see it if opacities are small, which is why its Gaussians could not fade."""
     slopes = {}
     for gate in (0.0, 0.05):
         scene = random_scene("smoe_eq7", opacity=(1e-7, 2e-7), scale=0.3, background_gate=gate).requiring_grad()

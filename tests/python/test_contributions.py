@@ -121,6 +121,12 @@ def test_the_gate_map_is_what_the_image_was_blended_of(mode, dtype):
     clear = best.values[0] > 1.0001 * best.values[1]  # rounding may turn what is closer
     assert clear.sum() > 500 and torch.equal(actual.gaussians[clear], best.indices[0][clear].int())
     assert len(actual.gaussians.unique()) > 20
+    order = torch.arange(len(splats.depths)) if mode == "smoe_std" else splats.depths.argsort()
+    sums = rendering.color[order].cumsum(0)
+    half = torch.where(sums[-1] >= 0.5, order[(sums >= 0.5).int().argmax(0)], -1)
+    clear = ((sums - 0.5).abs() > 1e-4).all(0)
+    assert clear.sum() > 500 and torch.equal(actual.medians[clear], half[clear].int())
+    assert len(actual.medians.unique()) > 10
 
 
 @with_gates

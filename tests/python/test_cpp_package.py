@@ -28,7 +28,7 @@ needs_cmake = pytest.mark.skipif(not (shutil.which("cmake") and shutil.which("c+
 
 
 def run(*words, **options):
-    """What a command prints; its output is the error where it fails."""
+    """What a command prints; its output is the error if it fails."""
     result = subprocess.run([str(word) for word in words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                             universal_newlines=True, **options)
     assert result.returncode == 0, result.stdout
@@ -38,7 +38,7 @@ def run(*words, **options):
 def build(source, folder, *options, prefixes=None):
     """Configures and builds a project, by default against the installed package.
 
-    Skips where GoogleTest or OpenCV, which it needs, is absent.
+    Skips if GoogleTest or OpenCV, which it needs, is absent.
     """
     generator = ["-G", "Ninja"] if shutil.which("ninja") else []
     where = ";".join(map(str, prefixes)) if prefixes else extension.cmake_prefix_path()
@@ -258,7 +258,7 @@ def shows_a_model(program, folder):
     with Image.open(folder / "image.ppm") as image:
         shown = np.asarray(image).astype(int)
     assert expected.mean() > 0.1
-    # One step, where exp or sigmoid of torch is another float.
+    # One step, if exp or sigmoid of torch is another float.
     assert np.abs(shown - (expected.clamp(0, 1) * 255).round().permute(1, 2, 0).numpy()).max() <= 1
     (folder / "other.ply").write_text("ply\n")
     result = subprocess.run([str(program), str(folder / "other.ply"), str(folder / "other.ppm")],

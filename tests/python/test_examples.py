@@ -112,7 +112,7 @@ def test_the_notebook_shows_what_a_run_from_top_to_bottom_gives():
 
 
 def run_cell(source, variables):
-    """Runs a cell as a notebook does; returns the value of its last line, where that is an expression."""
+    """Runs a cell as a notebook does; returns the value of its last line, if that is an expression."""
     tree = ast.parse(source)
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     exec(compile(tree, "cell", "exec"), variables)

@@ -367,7 +367,7 @@ def every_call():
                            "wants_background": True},
         "project_backward": {"records": random_normal((20, 6 + features.shape[1]), 1, torch.float32),
                              "dL_ddepths": depth, **inputs, "features": features, "radii": radii, "wanted": belongs},
-        "contributions": {"pixel_weights": maps, **kept}, "gate_map": kept,
+        "contributions": {"pixel_weights": maps, **kept}, "gate_map": {"gate_sum": images["gate_sum"], **kept},
         "importance": {"pixel_weights": maps, "share_weights": maps, "color": images["color"],
                        "gate_sum": images["gate_sum"], **kept},
         "pack_footprints": {**footprints, "visible": torch.arange(3)},

@@ -1,7 +1,7 @@
 """The package against finite differences in float64: all modes, all inputs, and the optional outputs.
 
-Every scene keeps its pairs away from the thresholds of its mode, where the image jumps and has no derivative, and its
-opacities under 0.99, where the gradient is passed straight through a clamp.
+Every scene keeps its pairs away from the thresholds of its mode, at which the image has no derivative, and its
+opacities under 0.99, above which the gradient is passed straight through a clamp.
 """
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from diff_smoe_rasterization import Importance, rasterize_with_splats, reference
 
 pytestmark = pytest.mark.usefixtures("device")
 
-# float64: sums of some thousand terms, whose roundings of 1e-16 grow by 1 / (1 - alpha) <= 100 and, where a pixel's
+# float64: sums of some thousand terms, whose roundings of 1e-16 grow by 1 / (1 - alpha) <= 100 and, if a pixel's
 # other owners are faint, by their share of it.
 TOLERANCE = 1e-9
 
@@ -82,7 +82,7 @@ def test_full_pixels_hide_no_more_than_they_may_reveal(mode):
     splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
     actual, expected = splats.importance(ones), expected_of(scene, ones, ones)
     assert_close(actual.shares, expected.shares, TOLERANCE, "shares")
-    # A pixel stops where a pair of alpha <= 0.9 would lead below 1e-4, so at T < 1e-3. Without a Gaussian that is 10 T
+    # A pixel stops if a pair of alpha <= 0.9 would lead below 1e-4, so at T < 1e-3. Without a Gaussian that is 10 T
     # at most, of colours that differ by sqrt(3) at most; D' is 0.99 at least there.
     transmittance = transmittance_of(scene)
     may_reveal = 10 * transmittance[transmittance < 1e-3] * 3**0.5 / 0.99

@@ -14,7 +14,7 @@ from diff_smoe_rasterization.settings import OUTPUTS
 pytestmark = pytest.mark.usefixtures("device")
 
 COUNT = 40
-# Where another Gaussian is left out, sums over Gaussians and tiles may be formed in another order.
+# If another Gaussian is left out, sums over Gaussians and tiles may be formed in another order.
 REORDERED = 1e-5
 ATTRIBUTES = [
     ("means3D", {}), ("opacities", {}), ("shs", {}), ("scales", {}), ("rotations", {}), ("dc", dict(split_dc=True)),

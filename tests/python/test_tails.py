@@ -185,7 +185,7 @@ def test_equals_the_reference_on_both_sides_of_the_threshold(mode, channels):
                                      **given)
     assert torch.equal(splats.contributions(maps[0]).pixels.cpu(), contributions.pixels)
     assert_all_close(splats.contributions(maps[0])._asdict(), contributions._asdict(), EXACT)
-    # Roundings grow by 1 / (1 - alpha), up to 100, and where a pixel's other owners are faint.
+    # Roundings grow by 1 / (1 - alpha), up to 100, and if a pixel's other owners are faint.
     assert_all_close(splats.importance(*maps)._asdict(), worth._asdict(), 1e-9)
 
 

@@ -10,7 +10,7 @@ from scenes import REMOVABLE_MODES, gradients, op_arguments, op_results, random_
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
-# torch.compile of 2.4.1 breaks the graph where the package looks at its arguments; 2.11 and 2.15 do not.
+# torch.compile of 2.4.1 breaks the graph when the package looks at its arguments; 2.11 and 2.15 do not.
 WHOLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)
 NUM_IMAGES = 2 + len(OUTPUTS)  # results of the op that are the caller's: color and radii too
 
@@ -132,7 +132,8 @@ def test_opcheck_of_gate_map(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
     images, saved = op_results(scene)
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.gate_map.default,
-                          op_arguments(scene, "gate_map", radii=images["radii"], saved=list(saved.values())))
+                          op_arguments(scene, "gate_map", saved=list(saved.values()),
+                                       **{name: images[name] for name in ("gate_sum", "radii")}))
 
 
 @pytest.mark.parametrize("mode", REMOVABLE_MODES)

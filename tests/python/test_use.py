@@ -191,7 +191,7 @@ SECOND = {"rasterize": second_of_rasterize, "rasterize_with_splats": second_of_s
 
 @pytest.mark.parametrize("name", SECOND)
 def test_second_derivatives_are_refused(name):
-    """By each leaf of each gradient, of a loss that is linear in the result, where other terms have a derivative."""
+    """By each leaf of each gradient, of a loss that is linear in the result and has further terms."""
     leaves, result = SECOND[name]()
     loss = result.sum() + sum((leaf ** 2).sum() for leaf in leaves.values())
     firsts = torch.autograd.grad(loss, list(leaves.values()), create_graph=True)
@@ -249,7 +249,7 @@ def test_torch_func_is_refused():
 
 
 def test_forward_mode_is_refused():
-    """Where it were not, every tangent would be zero. Plain tensors may be rendered meanwhile."""
+    """If it were not, every tangent would be zero. Plain tensors may be rendered meanwhile."""
     scene = random_scene("smoe", 20, 20, 18, degree=1, dtype=torch.float32)
     image = rasterize(settings=scene.settings, **scene.inputs).color
 

@@ -77,7 +77,7 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map) {
   refuse_gate_map("cpu::gate_map", frame, map);
   for_each_band(frame, nullptr, [&](const Frame<S>& band) {
-    walk_tiles(band, GateMapPass<S>{map}, tile_kernels<S>().gate_map, kScratchFeatures<GateMapPass<S>>);
+    walk_tiles(band, gate_map_pass<S>(frame, map), tile_kernels<S>().gate_map, kScratchFeatures<GateMapPass<S>>);
   });
 }
 

@@ -35,9 +35,9 @@ template <class S, BlendMode kBlendMode, class Pass> class PassVisitor {
       num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
       if constexpr (kSums) {
         last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
-        State<S> state = pass_.begin(index);
-        each_array([&](PixelArray<S> array, S number) { array.pixel(x, y) = number; }, state);
       }
+      State<S> state = pass_.template begin<kMode>(index);
+      each_array([&](PixelArray<S> array, auto number) { array.pixel(x, y) = S(number); }, state);
     });
     return num_seen;
   }

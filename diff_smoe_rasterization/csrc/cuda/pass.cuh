@@ -97,7 +97,7 @@ __global__ void __launch_bounds__(kWalkBlock, kPassBlocks<S, Pass>)
     pixels.walked[k] = PixelState<S>::open();
     if (!tile.inside(arguments, k)) continue;
     const int64_t index = tile.pixel_index(arguments, k);
-    if constexpr (Sums::kNum > 0) pixels.state[k] = arguments.pass.begin(index);
+    pixels.state[k] = arguments.pass.template begin<kMode>(index);
     pixels.last[k] = arguments.saved.last_contributor[index];
     pixels.wide[k] = Blend<kMode>::kNearFirst && is_wide(arguments.saved.final_transmittance[index]);
     wide |= pixels.wide[k];

@@ -14,7 +14,7 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work) {
   refuse_gate_map("cuda::gate_map", frame, map);
-  walk_tiles(frame, GateMapPass<S>{map}, work);
+  walk_tiles(frame, gate_map_pass<S>(frame, map), work);
 }
 
 #define DSMOE_INSTANTIATE(S)                                                            \

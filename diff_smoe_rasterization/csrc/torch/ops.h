@@ -403,20 +403,25 @@ template <class Backend> void importance(Arguments& arguments) {
 }
 
 template <class Backend> void gate_map(Arguments& arguments) {
+  auto gate_sum = arguments.read<Tensor>();
   const auto radii = arguments.read<Tensor>();
   const auto saved = arguments.read<Saved>();
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
   const Expect expect = check_saved("gate_map", radii, saved, background_gate, options);
+  expect("gate_sum", gate_sum, {1, options.image_height, options.image_width});
   const typename Backend::Guard guard(radii.device());
   const auto image = [&] { return empty({options.image_height, options.image_width}, radii, kInt); };
-  const Tensor gaussians = image(), counts = image();
+  const Tensor gaussians = image(), counts = image(), medians = image();
+  gate_sum = gate_sum.contiguous();
   dispatch("gate_map", saved[0], [&](auto zero) {
     using S = decltype(zero);
-    const GateMap map = {mutable_data<int32_t>(gaussians), mutable_data<int32_t>(counts)};
-    Backend::template gate_map<S>(expect, radii, saved, blend_config<S>(background_gate, options), options, map);
+    const GateMap map = {mutable_data<int32_t>(gaussians), mutable_data<int32_t>(counts),
+                         mutable_data<int32_t>(medians)};
+    Backend::template gate_map<S>(expect, gate_sum, radii, saved, blend_config<S>(background_gate, options), options,
+                                  map);
   });
-  arguments.give_back(gaussians, counts);
+  arguments.give_back(gaussians, counts, medians);
 }
 
 template <class Backend>

@@ -156,9 +156,11 @@ struct Cpu {
   }
 
   template <class S>
-  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
-                       const Options& options, const GateMap& map) {
-    cpu::gate_map(walked<S>(expect, radii, saved, config, options), map);
+  static void gate_map(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
+                       const RasterConfig<S>& config, const Options& options, const GateMap& map) {
+    auto own = walked<S>(expect, radii, saved, config, options);
+    set_sums(own.saved, cpu::saved_sizes(own), mutable_data<S>(gate_sum));
+    cpu::gate_map(own, map);
   }
 
   template <class S>

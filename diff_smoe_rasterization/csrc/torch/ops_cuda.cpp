@@ -193,10 +193,12 @@ struct Cuda {
   }
 
   template <class S>
-  static void gate_map(const Expect& expect, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
-                       const Options& options, const GateMap& map) {
+  static void gate_map(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
+                       const RasterConfig<S>& config, const Options& options, const GateMap& map) {
+    auto own = walked<S>(expect, radii, saved, config, options);
+    set_sums(own.saved, cuda::saved_sizes(own, run(options, nullptr)), mutable_data<S>(gate_sum));
     TensorMemory memory(radii);
-    cuda::gate_map(walked<S>(expect, radii, saved, config, options), map, {current_stream(), &memory});
+    cuda::gate_map(own, map, {current_stream(), &memory});
   }
 
   template <class S>

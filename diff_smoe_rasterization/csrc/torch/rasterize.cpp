@@ -271,9 +271,10 @@ Importance Splats::importance(const at::Tensor& pixel_weights, const at::Tensor&
   return {sums[0].toTensor(), sums[1].toTensor(), sums[2].toTensor()};
 }
 
-std::pair<at::Tensor, at::Tensor> Splats::gate_map() const {
-  const auto maps = score("gate_map", {}, saved_of(*this, "gate_map"));
-  return {maps[0].toTensor(), maps[1].toTensor()};
+std::tuple<at::Tensor, at::Tensor, at::Tensor> Splats::gate_map() const {
+  const Saved& own = saved_of(*this, "gate_map");
+  const auto maps = score("gate_map", {own.gate_sum}, own);
+  return {maps[0].toTensor(), maps[1].toTensor(), maps[2].toTensor()};
 }
 
 // From a calibrated pinhole camera to the settings of a rendering, as camera.py does it for Python. The matrices are

@@ -80,9 +80,10 @@ const std::string kImportance =
     "Tensor[] saved, Tensor? background_gate, " +
     without_comma(kOptions) + ") -> (Tensor shares, Tensor squared_shares, Tensor removal_costs)";
 
-// From what one rasterize saved: the Gaussian of the greatest gate in each pixel [H, W], and how many have a part.
-const std::string kGateMap = "gate_map(Tensor radii, Tensor[] saved, Tensor? background_gate, " +
-                             without_comma(kOptions) + ") -> (Tensor gaussians, Tensor counts)";
+// From what one rasterize saved: the Gaussian of the greatest gate in each pixel [H, W], how many have a part, and the
+// median one.
+const std::string kGateMap = "gate_map(Tensor gate_sum, Tensor radii, Tensor[] saved, Tensor? background_gate, " +
+                             without_comma(kOptions) + ") -> (Tensor gaussians, Tensor counts, Tensor medians)";
 
 }  // namespace
 

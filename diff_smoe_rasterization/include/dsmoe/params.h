@@ -173,10 +173,13 @@ template <class S> struct ImportanceMap {
   ImportanceSums<S> sums;
 };
 
-// Per pixel; both are written whole.
+// Per pixel; all are written whole.
 struct GateMap {
   int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 if none is
   int32_t* counts = nullptr;     // [H, W] how many Gaussians the numerator has
+  // [H, W] the one with which the weights, in the order of the list, reach half of the denominator; -1 where none does.
+  // Or null
+  int32_t* medians = nullptr;
 };
 
 // Any of these may be null. Then that output was not used.

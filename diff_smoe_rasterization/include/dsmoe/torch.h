@@ -16,6 +16,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -114,9 +115,10 @@ class Splats {
   /// pixel_weights: [H, W] e; undefined: 1. share_weights: [H, W] e of the shares; undefined: pixel_weights.
   Importance importance(const at::Tensor& pixel_weights = {}, const at::Tensor& share_weights = {}) const;
 
-  /// Returns gaussians [H, W] int32, which has the largest gate of the pixel, -1 if none has one; and counts [H, W]
-  /// int32, how many Gaussians are in the numerator.
-  std::pair<at::Tensor, at::Tensor> gate_map() const;
+  /// Returns three images [H, W] int32. gaussians: which has the largest gate of the pixel, -1 where none has one.
+  /// counts: how many Gaussians are in the numerator. medians: with which one the weights, front to back (in
+  /// `smoe_std` by index), reach half of the denominator, -1 where none does.
+  std::tuple<at::Tensor, at::Tensor, at::Tensor> gate_map() const;
 
   struct Saved;                        // of the implementation
   std::shared_ptr<const Saved> saved;  // likewise

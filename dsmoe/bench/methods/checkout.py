@@ -97,7 +97,7 @@ class ThreeDGS:
         return {name: getattr(self.config, name) for name in RECIPE if name in options}
 
     def rules(self) -> Dict[str, Any]:
-        """What the row's protocol says otherwise than of the native trainer; None where there is no such thing."""
+        """What the row's protocol says otherwise than of the native trainer; None if there is no such thing."""
         own = {word.partition("=")[0] for word in self.method["arguments"]}
         recipe = {name: value for name, value in self.recipe().items() if "--" + name not in own}
         rules = {"strategy": self.cell["strategy"], "recipe": recipe, "scale_recipe": False,
@@ -203,7 +203,7 @@ class HAC(InOneProcess):
     of_gaussians = False  # anchors, from which networks make Gaussians
 
     def test_arguments(self) -> List[Any]:
-        return ["--eval", "--test_iterations", self.config.iterations]  # the model is encoded where it is tested last
+        return ["--eval", "--test_iterations", self.config.iterations]  # the last test encodes the model
 
     def own_bytes(self) -> int:
         return size_of(os.path.join(self.model, "bitstreams"))
@@ -286,7 +286,7 @@ def linked_scene(source: str, folder: str) -> None:
 
 
 def matched(scene: Scene, seen: List[Dict[str, Any]], label: str) -> List[Tuple[View, Dict[str, Any]]]:
-    """Our test views with the trainer's renderings. Raises BenchError where the split is not the same."""
+    """Our test views with the trainer's renderings. Raises BenchError if the split is not the same."""
     by_name = {Path(row["name"]).stem: row for row in seen}  # trainers keep folder and extension, or drop them
     expected = {Path(view.camera.name).stem for view in scene.test}
     wrong = sorted(expected ^ set(by_name))
@@ -315,7 +315,7 @@ def measured(pairs: List[Tuple[View, Dict[str, Any]]], measures: Measures, devic
 
 
 def size_of(path: str) -> int:
-    """Bytes of a file, or of all files in a folder. Raises BenchError where it is absent."""
+    """Bytes of a file, or of all files in a folder. Raises BenchError if it is absent."""
     if not os.path.exists(path):
         raise BenchError(f"{path}: no such file; the trainer left no model there")
     return sum(file.stat().st_size for file in [Path(path), *Path(path).rglob("*")] if file.is_file())

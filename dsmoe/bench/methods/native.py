@@ -23,7 +23,7 @@ from .outcome import Outcome, scene_of
 
 
 def run_native(cell: Dict[str, Any], output: str) -> Outcome:
-    """Trains in output/run, continuing where an earlier attempt stopped, and measures. Raises TrainerError."""
+    """Trains in output/run, continuing an earlier attempt, and measures. Raises TrainerError."""
     folder = os.path.join(output, "run")
     config = config_of(cell, folder)
     set_up_process(config.device)

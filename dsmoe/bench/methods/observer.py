@@ -8,7 +8,7 @@ they seed with constants, show their loop as a tqdm bar over the iterations, and
 
 RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, background_gate, views [{name, milliseconds, file, truth}]. The
 files of the renderings are arrays [3, H, W] of float32, unclamped, in FOLDER. The gate is a learned one, as it is when
-the script ends; null where nothing was rendered with such a gate.
+the script ends; null if nothing was rendered with such a gate.
 """
 import argparse
 import importlib.abc

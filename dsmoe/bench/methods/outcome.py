@@ -34,7 +34,7 @@ class Outcome:
 
 
 def scene_of(config: TrainConfig) -> Scene:
-    """Raises BenchError, before anything is trained, where there would be nothing to measure."""
+    """Raises BenchError, before anything is trained, if there would be nothing to measure."""
     scene = load_scene(config, progress=False)
     if not scene.test:
         raise BenchError(f"scene {config.scene} has no test views: nothing could be measured")

@@ -37,8 +37,8 @@ NOT_PROTOCOL = ("seed", "strategy", "densify_grad_threshold", "init_points", "ve
 def report(results: str, output: str) -> str:
     """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT; returns the page's path.
 
-    An earlier report there is replaced once the new one is made. Raises ReportError where there are no rows, where a
-    row is damaged or where rows cannot be compared, TrainerError where OUTPUT cannot be written or has something else.
+    An earlier report there is replaced once the new one is made. Raises ReportError if there are no rows, if a
+    row is damaged or if rows cannot be compared, TrainerError if OUTPUT cannot be written or has something else.
     """
     rows = read_rows(results)
     make_folder(output)

@@ -47,7 +47,7 @@ class Setting(NamedTuple):
         return self.blend.partition(" ")[0]
 
     def label(self, blend: bool = True) -> str:
-        """Such as "native, smoe, steady"; it says where a checkout is unpatched or fused."""
+        """Such as "native, smoe, steady"; it says whether a checkout is unpatched or fused."""
         told = self.variant in (None, "native", "patched") or self.variant in self.name
         words = [self.name if told else f"{self.name}-{self.variant}"] + [self.blend] * blend
         words += [self.strategy] if self.strategy not in (None, PAPER_STRATEGY) else []
@@ -106,12 +106,12 @@ class Group:
         return over([self], name, lambda figures: figures[0])
 
     def measured_or_failed(self, names: Sequence[str]) -> List[Cell]:
-        """Those of several figures; where no seed has any, PSNR's place says so."""
+        """Those of several figures; if no seed has any, PSNR's place says so."""
         failed = bool(self.failed and not self.rows)
         return [Cell(text="failed") if failed and name == "psnr" else self.measured(name) for name in names]
 
     def seeds(self) -> str:
-        """How many seeds the figures are of, such as "3", or "2 of 3" where one failed."""
+        """How many seeds the figures are of, such as "3", or "2 of 3" if one failed."""
         return str(len(self.rows)) if not self.failed else f"{len(self.rows)} of {len(self.rows) + len(self.failed)}"
 
 

@@ -26,11 +26,11 @@ SHARED_NOTE = (f"Times and FPS are of cells that shared no GPU or CPU. {grouping
 SPREAD_NOTE = "± is the sample standard deviation over seeds; figures without it are of one seed."
 
 ByScene = Dict[str, Group]
-Place = Tuple[Optional[str], List[str]]  # the paper's name of a set of scenes, None where it prints one figure for all
+Place = Tuple[Optional[str], List[str]]  # the paper's name of a set of scenes, None if it prints one figure for all
 
 
 def end_of(row: Row) -> Optional[str]:
-    """ "sparse" or "dense" where a row belongs to that end of the paper's tables: as it says, or by its threshold."""
+    """ "sparse" or "dense" if a row belongs to that end of the paper's tables: as it says, or by its threshold."""
     by_threshold = {threshold: end for end, threshold in PAPER["ends"].items()}
     own = None if row.get("budget") is not None else by_threshold.get(row.get("densify_grad_threshold"))
     return row.get("end") or own
@@ -201,7 +201,7 @@ def _averages(setting: Setting, settings: Dict[Setting, ByScene], scenes: Sequen
 
 
 def _beside(setting: Setting, settings: Dict[Setting, ByScene], scenes: Sequence[str]) -> List[Group]:
-    """What takes its averages of the same seeds: every scene, in alpha and smoe too where these have all scenes."""
+    """What takes its averages of the same seeds: every scene, in alpha and smoe too if these have all scenes."""
     blends = [by_scene for other, by_scene in settings.items() if other == setting
              or (other.pair == setting.pair and other.mode in COMPARED)]
     return [by_scene[scene] for by_scene in blends for scene in scenes

@@ -131,8 +131,9 @@ TEST_P(Modes, GradientsAreTheCores) {
   dsmoe::cpu::contributions(frame,
                             {data(e), {data(sums[0]), pixels.data_ptr<int32_t>(), data(sums[1]), data(sums[2])}});
   dsmoe::cpu::importance(frame, {data(color), data(e), data(f), {data(sums[3]), data(sums[4]), data(sums[5])}});
-  const at::Tensor greatest = at::zeros({kSize, kSize}, at::kInt), counts = at::zeros({kSize, kSize}, at::kInt);
-  dsmoe::cpu::gate_map(frame, {greatest.data_ptr<int32_t>(), counts.data_ptr<int32_t>()});
+  const auto map = [] { return at::zeros({kSize, kSize}, at::kInt); };
+  const at::Tensor greatest = map(), counts = map(), medians = map();
+  dsmoe::cpu::gate_map(frame, {greatest.data_ptr<int32_t>(), counts.data_ptr<int32_t>(), medians.data_ptr<int32_t>()});
   EXPECT_EQ(counts.sum().item<int64_t>(), pixels.sum().item<int64_t>());
   for (const bool differentiable : {true, false}) {
     const c10::AutoGradMode mode(differentiable);
@@ -145,8 +146,8 @@ TEST_P(Modes, GradientsAreTheCores) {
                                             importance.squared_shares,   importance.removal_costs};
     for (size_t i = 0; i < sums.size(); ++i) EXPECT_TRUE(at::equal(actual[i], sums[i])) << "sums " << i;
     EXPECT_TRUE(at::equal(contributions.pixels, pixels));
-    const auto [gaussians, in_pixels] = splats.gate_map();
-    EXPECT_TRUE(at::equal(gaussians, greatest) && at::equal(in_pixels, counts));
+    const auto [gaussians, in_pixels, halfway] = splats.gate_map();
+    EXPECT_TRUE(at::equal(gaussians, greatest) && at::equal(in_pixels, counts) && at::equal(halfway, medians));
     EXPECT_GT(pixels.sum().item<int64_t>(), 0);
     const at::Tensor ones = at::ones({kSize, kSize}, at::kDouble);
     EXPECT_TRUE(at::equal(splats.importance().shares, splats.importance(ones, ones).shares));

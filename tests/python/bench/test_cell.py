@@ -23,7 +23,7 @@ def cell_file(content, tmp_path):
 
 
 def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatch):
-    """As the system does where memory is short."""
+    """As the system does if memory is short."""
     says = "echo the last words\nprintf 'Training:  50%%|#### | 5/10 [00:01<00:01, 5.0it/s]'\nkill -9 $$\n"
     monkeypatch.setattr(cells.sys, "executable", python_that(says, tmp_path))
     row = cells.supervise(str(cell_file), str(tmp_path / "out"))

@@ -165,7 +165,7 @@ def test_views_are_held_out_and_rendered_by_the_model_itself(tmp_path, monkeypat
 
 
 def test_a_trainers_own_lpips_needs_no_weights(monkeypatch):
-    """As HAC and HAC++ call it. Where there is no network, the download of weights is an error."""
+    """As HAC and HAC++ call it. If there is no network, the download of weights is an error."""
     for name in ("lpips", "lpipsPyTorch"):
         monkeypatch.setitem(sys.modules, name, None)
     observer.without_lpips()

@@ -389,7 +389,7 @@ def test_queues_are_snakemakes_business(on_gpus, monkeypatch):
 @pytest.mark.parametrize("jobs, count, at_once, threads", [
     (None, 4, 1, 8), (1, 4, 1, 8), (3, 4, 3, 3), (16, 4, 4, 2), (16, 1, 1, 8)])
 def test_on_the_cpu_cells_share_its_cores(jobs, count, at_once, threads, content, monkeypatch):
-    """As many threads as torch takes, if there are cores for them: 10 cores here, where torch takes 8."""
+    """As many threads as torch takes, if there are cores for them: 10 cores here, of which torch takes 8."""
     suite = expand({**content, "seeds": [0, 1]}, "")
     monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(10), raising=False)

@@ -105,7 +105,7 @@ def test_a_file_that_does_not_fit_is_the_reason(monkeypatch, tmp_path, content, 
 
 
 # torchvision's networks: (channels, kernel's side, stride, padding) of convolutions, of VGG an eighth of the channels;
-# (side, stride) of maximum poolings; None where LPIPS looks.
+# (side, stride) of maximum poolings; None: LPIPS looks there.
 NETWORKS = {"alex": [(64, 11, 4, 2), None, (3, 2), (192, 5, 1, 2), None, (3, 2), (384, 3, 1, 1), None,
                      (256, 3, 1, 1), None, (256, 3, 1, 1), None],
             "vgg": [*2 * [(8, 3, 1, 1)], None, (2, 2), *2 * [(16, 3, 1, 1)], None, (2, 2), *3 * [(32, 3, 1, 1)], None,

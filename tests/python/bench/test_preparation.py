@@ -1,4 +1,4 @@
-"""What cells need is made, and made anew where what it was made of has changed."""
+"""What cells need is made, and made anew if what it was made of has changed."""
 import shutil
 import subprocess
 from pathlib import Path

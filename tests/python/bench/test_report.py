@@ -12,7 +12,7 @@ from dsmoe.bench.report import ReportError, curves, groups, layouts, tables
 
 
 def table_of(entries, name, suite="table1"):
-    """The table NAME of rows; None where the suite has none."""
+    """The table NAME of rows; None if the suite has none."""
     made = layouts.tables_of(suite, entries)
     return next((table for table in made if table.name == f"{suite}_{name}"), None)
 
@@ -213,7 +213,7 @@ def test_every_line_of_latex_and_markdown_has_all_columns(name):
                                          ("train_views", 7), ("test_views", 7), ("scale_recipe", True),
                                          ("recipe", {"lambda_dssim": 0.0})])
 def test_rows_of_a_rarer_protocol_are_left_out_and_named(name, value):
-    """Where none is the commonest, nobody knows which: that is refused."""
+    """If none is the commonest, nobody knows which: that is refused."""
     other = smoe(protocol={**PROTOCOL, name: value})
     with pytest.raises(ReportError, match=name) as caught:
         rows.of_one_protocol([row(), other])

@@ -77,7 +77,7 @@ def sum_of_gate_terms(scene, outputs, weights):
 
 
 def compare_radii(actual, expected):
-    """A radius is the ceiling of a root that float32 rounds by 1e-4 where it is 1000 px: so many may differ by 1."""
+    """A radius is the ceiling of a root that float32 rounds by 1e-4 if it is 1000 px: so many may differ by 1."""
     assert actual.dtype == torch.int32
     different = (actual != expected).nonzero()[:, 0]
     assert len(different) <= max(1, 1e-4 * len(expected)), f"{len(different)} of {len(expected)} radii differ"

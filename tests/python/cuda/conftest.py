@@ -1,4 +1,4 @@
-"""Tests that only a GPU can run; they are skipped, saying so, where there is none."""
+"""Tests that only a GPU can run; they are skipped, saying so, if there is none."""
 from __future__ import annotations
 
 import pytest

@@ -20,8 +20,8 @@ from diff_smoe_rasterization import reference
 POSITION = 2e-7  # of the larger side of the image: (ndc + 1) is rounded, then its product with the side
 COVARIANCE = 3e-7  # of a covariance's entries; its inverse multiplies that by the condition number
 DEPTH = 1e-6  # of a depth: four products that cancel in part
-ALPHA = 5e-7  # of alpha, where the exponent is exact
-COLOR = 2e-5  # of a sum of colours up to 2, where all alphas are exact
+ALPHA = 5e-7  # of alpha, if the exponent is exact
+COLOR = 2e-5  # of a sum of colours up to 2, if all alphas are exact
 MOST_DECISIONS = 8
 PIXELS_AT_ONCE = 32
 

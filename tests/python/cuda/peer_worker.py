@@ -41,7 +41,7 @@ def jacobian_is_clamped(means3D, settings):
 
 
 def image_gradient(left_out):
-    """Fixed random numbers [3, H, W], 0 where `left_out` is set."""
+    """Fixed random numbers [3, H, W], 0 if `left_out` is set."""
     generator = torch.Generator(device="cpu").manual_seed(0)
     return torch.randn(3, *left_out.shape, generator=generator).to(left_out.device) * ~left_out
 
@@ -61,7 +61,7 @@ def leaves_of(inputs):
 
 
 def against_inria(model, view, peer):
-    """One view in `alpha` mode; `dr_aa` is antialiased where its renderer says so."""
+    """One view in `alpha` mode; `dr_aa` is antialiased if its renderer says so."""
     settings = model.settings(view, "alpha")
     antialiasing = bool(peer.more_settings.get("antialiasing"))
     settings = settings._replace(antialiasing=antialiasing)

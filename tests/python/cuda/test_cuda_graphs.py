@@ -80,7 +80,7 @@ class TrainingStep:
 def assert_same(actual, expected):
     torch.testing.assert_close(actual[0], expected[0], rtol=1e-5, atol=1e-5)  # another kernel may sum in another order
     assert torch.equal(actual[1], expected[1])
-    # Long lists are walked in segments, and whole where they are outgrown: T is rounded in other places, thousands of
+    # Long lists are walked in segments, and whole if they are outgrown: T is rounded in other places, thousands of
     # times, before terms that cancel in part are summed.
     assert_same_gradients(actual[2], expected[2], 1e-4)
 
@@ -91,7 +91,7 @@ def scene_of(mode, seed=0, **options):
 
 
 def with_other_gate(scene, value):
-    """Returns the scene with a background gate of that value, where it has one that is a tensor."""
+    """Returns the scene with a background gate of that value, if it has one that is a tensor."""
     gate = scene.settings.background_gate
     return scene.with_settings(background_gate=torch.full_like(gate, value)) if torch.is_tensor(gate) else scene
 

@@ -32,7 +32,7 @@ def test_float64_equals_the_cpu(mode, name, gpu):
     expected = importance_of(scene, "cpu", torch.float64, maps)
     actual = importance_of(scene, gpu, torch.float64, maps)
     for field, values, other in zip(Importance._fields, actual, expected):
-        # Roundings of 1e-16 in sums of thousands of positive terms, which grow by 1 / (1 - alpha) <= 100 and, where
+        # Roundings of 1e-16 in sums of thousands of positive terms, which grow by 1 / (1 - alpha) <= 100 and, if
         # a pixel's other owners are faint, by their share of it.
         assert_close(values, other, 1e-9, field)
     assert (expected.removal_costs > 0).sum() > 5

@@ -38,7 +38,7 @@ def test_needles_that_pass_by_more_macro_tiles_than_they_meet_tiles(mode, gpu):
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 @pytest.mark.parametrize("fits", [True, False])
 def test_tiles_come_in_the_order_of_their_lists_lengths(mode, fits, gpu):
-    """Each tile once, the longest lists first by classes of 64 instances; also where the lists do not fit."""
+    """Each tile once, the longest lists first by classes of 64 instances; also if the lists do not fit."""
     # Another size for each case: what an earlier rendering of the size needed decides whether the lists fit.
     scene = random_scene(mode, 12_000, 333 + 16 * fits, 217, scale=0.1, degree=0, dtype=torch.float32).to(gpu)
     if not fits:  # the next rendering has room for as many as small Gaussians have, in steps of 65,536

@@ -1,10 +1,10 @@
-"""Against public rasterizers, where they are: $DSMOE_PEERS holds a folder each (inria, dr_aa, gsplat) with its package.
+"""Against public rasterizers, if there: $DSMOE_PEERS holds a folder each (inria, dr_aa, gsplat) with its package.
 
 $DSMOE_BIG_MODEL is the model: an .npz that benchmarks/timing/models.py reads (gpu_rasterizer.py --save-npz writes one
 of a trained .ply and its scene). Without it a made-up one is used.
 
 Known differences, each with its test or the reason why there is none:
-- Inria's backward is not the derivative of its forward where the projection's Jacobian is clamped, beyond 1.3 tan(fov /
+- Inria's backward is not the derivative of its forward if the projection's Jacobian is clamped, beyond 1.3 tan(fov /
   2): it counts a part of dz twice. Those Gaussians' gradients of the means are left out.
 - Its antialiasing (dr_aa) differentiates sqrt(det / det') with the low-pass added to both determinants.
 - 3dgs_accel subtracts the background twice in its backward; with a black one nothing shows. It is not compared.
@@ -47,7 +47,7 @@ def model(gpu, tmp_path):
 
 
 def package(name):
-    """Folder of a peer; skips the test where it is not."""
+    """Folder of a peer; skips the test if it is absent."""
     folder = os.path.join(os.environ.get("DSMOE_PEERS", ""), name)
     if not os.environ.get("DSMOE_PEERS") or not os.path.isdir(folder) or not os.listdir(folder):
         pytest.skip(f"there is no {name} (set DSMOE_PEERS to the folder of installed rasterizers)")

@@ -71,7 +71,7 @@ def test_a_browser_shows_what_is_rendered(browser, tmp_path, mode, gate, degree,
 
 @pytest.mark.slow
 def test_a_gpu_that_cannot_blend_32_bit_floats_is_told_of(browser, tmp_path):  # noqa: F811
-    """Sums of 11 bits: a few grey levels where a pixel has many Gaussians, and the page says so."""
+    """Sums of 11 bits: a few grey levels if a pixel has many Gaussians, and the page says so."""
     gaussians = io.Gaussians(**{**vars(cloud()), "blend_mode": "alpha"})
     model, page = str(tmp_path / "model.ply"), str(tmp_path / "page.html")
     io.write_gaussians(model, gaussians)

@@ -107,7 +107,7 @@ def test_several_renderings_before_a_step_add_up(at_once):
 @pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
 @pytest.mark.parametrize("computed", [False, True])
 def test_of_several_optimizers_that_of_the_centres_counts(computed):
-    """Where the centres are computed, as in Scaffold-GS, the first one that steps."""
+    """If the centres are computed, as in Scaffold-GS, the first one that steps."""
     view, gaussians = scene()
     others = torch.optim.Adam([gaussians["opacities"]], lr=0)
     own = torch.optim.Adam([gaussians["means3D"]], lr=0)

@@ -59,7 +59,7 @@ def test_scales_may_be_three_of_six_columns(mode):
 
 
 def test_the_blend_mode_decides_what_is_seen(monkeypatch):
-    """A footprint reaches further where G cuts it: 4.8 sigma in place of tiles around 3."""
+    """A footprint reaches further if G cuts it: 4.8 sigma in place of tiles around 3."""
     def radii(scene, **settings):
         return GaussianRasterizer(scene.settings._replace(**settings)).visible_filter(
             **shape_of(scene, "means3D", "scales", "rotations"))

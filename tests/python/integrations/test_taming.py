@@ -169,7 +169,7 @@ def test_accum_blend_is_divided_by_no_gate_sum():
             scales=torch.full((1, 3), 1e-6, dtype=torch.float64))
         results = call(scene, torch.ones(33, 33, dtype=torch.float64))
         # A Gaussian of variance 0.3 px^2, summed over whole pixels: 2 pi 0.3, times a theta function near 1: by
-        # Poisson's formula the next term is 4 exp(-2 pi^2 0.3) = 0.011. Its tails are cut, where alpha < 1/255: 0.016.
+        # Poisson's formula the next term is 4 exp(-2 pi^2 0.3) = 0.011. Its tails are cut at alpha 1/255: 0.016.
         assert results["accum_blend"].item() == pytest.approx(0.25 * 2 * torch.pi * 0.3, rel=0.05)
         assert results["accum_count"].item() == results["accum_weights"].item()
 

@@ -30,7 +30,7 @@ def radii_of(step, rows):
 
 
 def gradients_of(step, radii, parameters):
-    """Zero where the row is not seen."""
+    """Zero if the row is not seen."""
     seen = (radii > 0).to(parameters[0].dtype)
     return [random_normal(parameter.shape, 1000 * step + i, parameter.dtype)
             * seen.view(-1, *[1] * (parameter.dim() - 1)) for i, parameter in enumerate(parameters)]

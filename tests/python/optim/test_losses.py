@@ -57,7 +57,7 @@ SHAPES = [(3, 1, 1), (1, 3, 40), (3, 17, 23), (1, 64, 32), (2, 3, 33, 65), (1, 1
 
 
 def assert_close(actual, expected, dtype):
-    """In double the same sums in another order; float32 loses digits where moments of order 1 are subtracted."""
+    """In double the same sums in another order; float32 loses digits if moments of order 1 are subtracted."""
     tolerance = 1e-12 if dtype == torch.float64 else 2e-5
     torch.testing.assert_close(actual.detach().cpu().double(), expected, rtol=0,
                                atol=tolerance * max(float(expected.abs().max()), 1e-3))

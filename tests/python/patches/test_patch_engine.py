@@ -9,8 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from checkouts import contents
-from tiny import ARGS, CHECKOUT, GR, PATCHED, RENDER, RENDERER, TRAIN, digest, make, marked, refused
+from checkouts import ARGS, CHECKOUT, GR, PATCHED, RENDER, RENDERER, TRAIN, contents, digest, make, marked, refused
 
 from dsmoe import patches
 from dsmoe.patches import engine

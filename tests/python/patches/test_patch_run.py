@@ -8,9 +8,8 @@ import subprocess
 import sys
 
 import pytest
-from checkouts import PACKAGE_PARENT, contents, environment
+from checkouts import GR, PACKAGE_PARENT, RENDERER, contents, environment, make, refused
 from packaged import ROOT, packages_and_data
-from tiny import GR, RENDERER, make, refused
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES
 from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES
@@ -465,7 +464,7 @@ GaussianRasterizer(None)
     ({"arguments/__init__.py": "class A:\n    optimizer_type: str = 'sparse_adam'\n"}, [], True),
     ({"submodules/own/diff_gaussian_rasterization/__init__.py": "class SparseGaussianAdam: 0\n"}, [], True)])
 def test_sparse_adam_is_offered_to_what_was_written_for_it(files, words, is_offered, tmp_path, python):
-    """Where 3DGS of 2024 finds it, it renders another way; forks for the branch without it break there."""
+    """If 3DGS of 2024 finds it, it renders another way; forks for the branch without it break there."""
     model = "class GaussianModel:\n    def get_features_dc(self): ...\n"
     make(tmp_path, {GR: OF_2024, "train.py": TRY_SPARSE, "scene/gaussian_model.py": model, **files})
     result = python("-m", "dsmoe", *PYTHON, *words, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))

@@ -1,4 +1,4 @@
-"""Where a patched trainer's blend mode and background gate come from."""
+"""The sources of a patched trainer's blend mode and background gate."""
 from __future__ import annotations
 
 import sys

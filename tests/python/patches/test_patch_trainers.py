@@ -8,8 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from checkouts import PACKAGE_PARENT, contents
-from tiny import ARGS, GR, RENDERER, TRAIN, make, refused
+from checkouts import ARGS, GR, PACKAGE_PARENT, RENDERER, TRAIN, contents, make, refused
 
 from dsmoe import patches
 from dsmoe.patches import facts

@@ -24,7 +24,7 @@ MODES = [("alpha", None), ("smoe", 0.0), ("smoe", 0.25), ("smoe_eq7", 0.0), ("sm
 
 
 def tool(name, *arguments, status=0):
-    """Runs a tool; returns what it said. Skips the test where the tool is not built."""
+    """Runs a tool; returns what it said. Skips the test if the tool is not built."""
     path = FOLDER / name
     if not path.is_file():
         pytest.skip(f"{path} is not built: cmake needs OpenCV (apt-get install libopencv-dev)")

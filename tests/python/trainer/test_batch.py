@@ -14,7 +14,7 @@ from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
 from dsmoe.train import train
-from dsmoe.training.background_gate import LearnedGate
+from dsmoe.training.gate import LearnedGate
 from dsmoe.training.trainer import Trainer
 
 
@@ -134,14 +134,14 @@ def test_a_batched_run_resumes_bit_for_bit(tiny_config, tmp_path, gate):
 @pytest.mark.skipif(not hasattr(torch.library, "register_fake"), reason="this PyTorch has no ops on the device meta")
 def test_a_gate_is_resumed_on_its_own_device(tiny_config):
     """A batch's checkpoint is read to the host. The device "meta" stands for a GPU: it has no numbers, but a place."""
-    trained = LearnedGate(tiny_config, "cpu")
+    trained = LearnedGate(tiny_config.gate, 1, "cpu")
     trained.step()
-    resumed = LearnedGate(tiny_config, "meta")
+    resumed = LearnedGate(tiny_config.gate, 1, "meta")
     state = trained.state_dict()
     resumed.load_state_dict(state)
     tensors = {name: value for name, value in resumed.state_dict()["adam"].items() if isinstance(value, torch.Tensor)}
     assert {*tensors} == {"exp_avg", "exp_avg_sq"} and {tensor.device.type for tensor in tensors.values()} == {"meta"}
-    again = LearnedGate(tiny_config, "cpu")
+    again = LearnedGate(tiny_config.gate, 1, "cpu")
     again.load_state_dict(state)
     again.gradient.fill_(3.0)
     again.step()

@@ -76,6 +76,6 @@ def test_commands_say_their_device_first(tiny_scene, tmp_path, capsys, monkeypat
         assert capsys.readouterr().out.startswith(f"{device_line('cpu')}\n")
     with open(os.path.join(run, "config.json"), encoding="utf-8") as file:
         assert json.load(file)["device"] == "cpu", "the one that it was trained on"
-    monkeypatch.setenv("DSMOE_DEVICE", "tpu")  # is not asked for where a run has its own
+    monkeypatch.setenv("DSMOE_DEVICE", "tpu")  # is not asked for if a run has its own
     assert main(["train", tiny_scene, "--resume", "-o", run, *short]) == 0
     assert main(["train", "--resume", "-o", run, "--device", "auto", "--quiet"]) == 0

@@ -220,7 +220,7 @@ def test_an_address_of_all_programs_is_no_torchrun(monkeypatch):
 
 @needs_gloo
 def test_processes_that_do_not_meet_say_so(monkeypatch, capsys):
-    """The second of two, where the first never comes: a line while it waits, another one at its end."""
+    """The second of two, if the first never comes: a line while it waits, another one at its end."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -14,7 +14,7 @@ from dsmoe.results.rendering import package_rasterizer
 from dsmoe.scenes.scene import load_scene
 from dsmoe.train import Run, train
 from dsmoe.training import strategy
-from dsmoe.training.background_gate import LearnedGate
+from dsmoe.training.gate import LearnedGate
 from dsmoe.training.strategies import STRATEGIES
 from dsmoe.training.strategy import Strategy
 from dsmoe.training.trainer import Trainer
@@ -74,7 +74,7 @@ def test_a_gate_that_a_rasterizer_leaves_out_stays(tiny_config, scene):
 @pytest.mark.parametrize("push", [1, -1])
 def test_a_learned_gate_without_a_bound_stays_positive_and_finite(tiny_config, push):
     """Whatever the gradient: a hundred steps of a rate of 10 would leave float32 behind."""
-    gate = LearnedGate(tiny_config.changed(background_gate="learned", background_gate_lr=10.0), "cpu")
+    gate = LearnedGate(tiny_config.changed(background_gate="learned", background_gate_lr=10.0).gate, 1, "cpu")
     for _ in range(100):
         gate.gradient.fill_(float(push))
         gate.step()

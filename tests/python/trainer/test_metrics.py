@@ -50,7 +50,7 @@ def test_a_mask_says_which_pixels_count_and_how_much():
 def test_masked_ssim_is_that_of_the_masked_pair_over_the_kept_pixels():
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 3, 30, 40, generator=generator).unbind(0)
-    # Everything kept: the kernel's own mean. float32 loses digits where moments are subtracted.
+    # Everything kept: the kernel's own mean. float32 loses digits if moments are subtracted.
     everything = torch.ones(1, 30, 40)
     assert masked_ssim(image, target, everything) == pytest.approx(float(fused_ssim(image, target)), abs=1e-5)
     # A kept rectangle in black: windows see zeros behind it, as behind the border of the rectangle alone.

@@ -47,14 +47,14 @@ def test_the_first_steps_are_those_of_the_cpu(tiny_config, scene, mode):
             continue  # of round Gaussians: their gradient is rounding, and Adam steps by its sign
         start = Trainer(config, scene).model.raw[name].detach().double()
         cpu, gpu = (trainer.model.raw[name].detach().cpu().double() for trainer in trainers)
-        # A step of Adam is about as large for a small gradient as for a large one, so that where a gradient is near 0
+        # A step of Adam is about as large for a small gradient as for a large one, so that if a gradient is near 0
         # rounding decides on its direction: up to 1 % of all numbers may go the other way, twice the distance.
         assert float((cpu - gpu).norm()) <= 2 * math.sqrt(0.01) * float((cpu - start).norm()), name
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_a_fixed_set_of_gaussians_ends_as_good_as_on_the_cpu(tiny_config, scene, tmp_path, mode):
-    scene = dataclasses.replace(scene, test=scene.train)  # measured where it learns
+    scene = dataclasses.replace(scene, test=scene.train)  # measured on what it learns
     config = tiny_config.changed(blend_mode=mode, densify_until_iter=0, iterations=300)
     configs = [dataclasses.replace(config, device=device, output=str(tmp_path / device)) for device in ("cpu", "cuda")]
     rows = [train(config, scene=scene, progress=False) for config in configs]

@@ -52,7 +52,7 @@ def rolled(camera, angle):
 
 @pytest.mark.parametrize("up", [[0, 1, 0], [0, 0, -1], [1, 2, -1]])
 def test_half_a_ring_of_tilted_photographs_has_its_up_and_is_turned_upright(up):
-    """All look down by 27 degrees to one side, where the mean of the images' vertical axes leans."""
+    """All look down by 27 degrees to one side, to which the mean of the images' vertical axes leans."""
     up = np.asarray(up) / np.linalg.norm(up)
     level = ring(np.array([1.0, -2.0, 0.5]), up, count=40)[:20]
     assert np.allclose(orbit_of_cameras(level).up, up)

@@ -1,4 +1,4 @@
-"""The captures beside the repository, where they are there: what the loader makes of them, and that they train."""
+"""The captures beside the repository, if they are there: what the loader makes of them, and that they train."""
 from __future__ import annotations
 
 import pytest

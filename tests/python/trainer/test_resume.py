@@ -22,7 +22,7 @@ from dsmoe.system import files
 from dsmoe.train import train
 from dsmoe.training import checkpoint, state_check
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
-from dsmoe.training.order import ViewOrder
+from dsmoe.training.randomness import ViewOrder
 from dsmoe.training.trainer import Trainer
 
 

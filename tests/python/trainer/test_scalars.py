@@ -1,4 +1,4 @@
-"""What a training writes for TensorBoard, where that is installed."""
+"""What a training writes for TensorBoard, if that is installed."""
 from __future__ import annotations
 
 import pytest
@@ -9,7 +9,7 @@ from dsmoe.train import train
 
 @pytest.fixture
 def no_tensorboard():
-    """Here it is used where it is installed."""
+    """Here it is used if it is installed."""
 
 
 def test_without_tensorboard_nothing_is_written(tmp_path, monkeypatch):

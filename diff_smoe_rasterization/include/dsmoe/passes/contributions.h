@@ -44,7 +44,7 @@ template <class S> struct ContributionPass {
   SumTargets<S> targets() const {
     return {{map.sums.pixel_weights, map.sums.blend_weights, map.sums.distances}, 3, map.sums.pixels};
   }
-  DSMOE_HD State<S> begin(int64_t pixel) const { return {map.pixel_weights[pixel]}; }
+  template <BlendMode kMode> DSMOE_HD State<S> begin(int64_t pixel) const { return {map.pixel_weights[pixel]}; }
   template <BlendMode kMode, class Real>
   DSMOE_HD Mask<Real> visit(PixelState<Real>& walked, const State<Real>& state, const WalkedPair<Real>& pair,
                             Contribution<Real>& sum) const {

@@ -2,17 +2,17 @@
 // features. csrc/cpu/tile_pass_impl.h and csrc/cuda/pass.cuh have the walks. A pass is a struct of S with its maps, and
 //
 //   State<Real>    what it knows of a pixel, or of a pack of pixels; `for_each` visits its kNum numbers
+//   begin<kMode>(pixel)   the State in front of all pairs; outside the image all its numbers are 0
 //   Sums<Real>     what it sums over the pixels of each Gaussian; `for_each` visits those of several side by side. Or
 //                  NoSums
 //   visit<kMode>(walked, state, pair, sums)   moves a pixel past a pair. Returns whether the pair adds to the sums
 //
-// With sums the State is what the caller's maps say of a pixel, and visits leave it as it is:
+// With sums the visits leave the State as it is:
 //
-//   begin(pixel)   the State; outside the image all its numbers are 0
 //   kCounts        whether the first of the sums is a whole number
 //   targets()      where they go
 //
-// Without them the State is what the visits have found. All its numbers begin with 0:
+// Without them the State is also what the visits have found:
 //
 //   end(state, pixel, gaussian_at)   writes it. gaussian_at(i): entry i of the tile's list
 #pragma once

@@ -8,7 +8,7 @@ import torch
 
 from diff_smoe_rasterization.learned_gate import launch_step, step_gate
 
-from ..config import TrainConfig
+from ..config import GateOptions
 from ..optimizer import batch_betas
 
 
@@ -18,11 +18,11 @@ class LearnedGate:
     A step is one kernel, without autograd and without an optimizer.
     """
 
-    def __init__(self, config: TrainConfig, device: str) -> None:
-        """config: has bound, start and rate; by its views a step rate and betas go as those of the Gaussians."""
-        self.bound = config.background_gate_bound
-        self.logarithm = torch.full((1,), math.log(config.background_gate_start - self.bound), device=device)
-        self._rate, self._betas = config.background_gate_lr * math.sqrt(config.batch), batch_betas(config.batch)
+    def __init__(self, options: GateOptions, batch: int, device: str) -> None:
+        """batch: views a step, by which rate and betas go as those of the Gaussians."""
+        self.bound = options.bound
+        self.logarithm = torch.full((1,), math.log(options.start - self.bound), device=device)
+        self._rate, self._betas = options.rate * math.sqrt(batch), batch_betas(batch)
         self._adam: Dict[str, Any] = {}
         self.value = torch.zeros_like(self.logarithm)  # [1], always this tensor, so that renderers may hold it
         self._evaluate()
