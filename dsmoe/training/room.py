@@ -1,0 +1,26 @@
+"""How many Gaussians fit into the memory of the GPUs, said before a training starts."""
+from __future__ import annotations
+
+import torch
+
+from ..config import TrainConfig
+
+# Numbers of memory that a Gaussian takes at the peak: for each of its parameters that one, its gradient, two moments of
+# Adam, and what a densification copies. Others are activations, places on the image, statistics and tile lists. By
+# benchmarks/RESULTS.md 1.2 to 3.0 million Gaussians of degree 3 add 1,431 B each (bonsai, alpha) and 1,517 B (smoe).
+FOR_EACH_PARAMETER, OTHERS = 5, 65
+OF_A_FURTHER_VIEW = 10  # of a batch: footprints and gradients, of what it shows, and gradients by places
+PARAMETERS_BESIDE_COLOR = 11  # mean, opacity, scales, rotation
+PIXEL_BYTES = 100  # about, of an image that is rendered and differentiated
+
+
+def gaussian_bytes(config: TrainConfig) -> int:
+    """About how much memory a Gaussian takes at the peak of a training."""
+    parameters = PARAMETERS_BESIDE_COLOR + 3 * (config.sh_degree + 1)**2
+    return 4 * (FOR_EACH_PARAMETER * parameters + OTHERS + OF_A_FURTHER_VIEW * (config.batch - 1))
+
+
+def free_bytes(pixels: int) -> int:
+    """How much of this process's GPU is left for Gaussians, where images have so many pixels."""
+    kept = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()  # by torch, for later
+    return max(0, torch.cuda.mem_get_info()[0] + kept - PIXEL_BYTES * pixels)
