@@ -9,7 +9,9 @@ from ..config import TrainConfig
 # Adam, and what a densification copies. Others are activations, places on the image, statistics and tile lists. By
 # benchmarks/RESULTS.md 1.2 to 3.0 million Gaussians of degree 3 add 1,431 B each (bonsai, alpha) and 1,517 B (smoe).
 FOR_EACH_PARAMETER, OTHERS = 5, 65
-OF_A_FURTHER_VIEW = 10  # of a batch: footprints and gradients, of what it shows, and gradients by places
+# In a batch also the gradients of one view beside their sum, and for each further view its footprints and gradients by
+# places. By docs/distributed.md that was 1,634 B with two views a step, 1,855 B with eight, without a densification.
+FOR_EACH_PARAMETER_OF_A_BATCH, OF_A_FURTHER_VIEW = 1, 10
 PARAMETERS_BESIDE_COLOR = 11  # mean, opacity, scales, rotation
 PIXEL_BYTES = 100  # about, of an image that is rendered and differentiated
 
@@ -17,7 +19,10 @@ PIXEL_BYTES = 100  # about, of an image that is rendered and differentiated
 def gaussian_bytes(config: TrainConfig) -> int:
     """About how much memory a Gaussian takes at the peak of a training."""
     parameters = PARAMETERS_BESIDE_COLOR + 3 * (config.sh_degree + 1)**2
-    return 4 * (FOR_EACH_PARAMETER * parameters + OTHERS + OF_A_FURTHER_VIEW * (config.batch - 1))
+    numbers = FOR_EACH_PARAMETER * parameters + OTHERS
+    if config.batch > 1:
+        numbers += FOR_EACH_PARAMETER_OF_A_BATCH * parameters + OF_A_FURTHER_VIEW * (config.batch - 1)
+    return 4 * numbers
 
 
 def free_bytes(pixels: int) -> int:
