@@ -10,7 +10,8 @@ from ..config import TrainConfig
 # benchmarks/RESULTS.md 1.2 to 3.0 million Gaussians of degree 3 add 1,431 B each (bonsai, alpha) and 1,517 B (smoe).
 FOR_EACH_PARAMETER, OTHERS = 5, 65
 # In a batch also the gradients of one view beside their sum, and for each further view its footprints and gradients by
-# places. By docs/distributed.md that was 1,634 B with two views a step, 1,855 B with eight, without a densification.
+# places. By benchmarks/results/distributed_*.jsonl 1,635 B with two views a step and 1,855 B with eight were the peak,
+# without a densification.
 FOR_EACH_PARAMETER_OF_A_BATCH, OF_A_FURTHER_VIEW = 1, 10
 PARAMETERS_BESIDE_COLOR = 11  # mean, opacity, scales, rotation
 PIXEL_BYTES = 100  # about, of an image that is rendered and differentiated
