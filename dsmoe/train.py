@@ -239,6 +239,19 @@ def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = F
     return sorted({name for name in known if name in PRODUCTS or re.fullmatch(model, name)})
 
 
+def room_text(trainer: Trainer) -> Optional[str]:
+    """How many Gaussians fit, and whether the strategy wants more; None on a CPU. All processes call it."""
+    room, most = trainer.room(), trainer.strategy.most()
+    if room is None:
+        return None
+    where = f"memory of {trainer.group.size} GPUs" if trainer.is_divided else "GPU's memory"
+    text = f"about {room:,} Gaussians fit into the {where}"
+    if most > room:
+        text += (f"; note: --strategy {trainer.config.strategy} grows to {most:,}; take a smaller --budget or more "
+                 "--gpus")
+    return text
+
+
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
           scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None, group: Optional[Group] = None,
           say: Optional[Callable[[str], None]] = None) -> Dict[str, Any]:
@@ -258,6 +271,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     check_device(config.device)
     if group and not group.leads:  # the folder is the first process's
         run = Run(new_trainer(config, scene or load_scene(config, False), rasterize, group), progress=False)
+        room_text(run.trainer)
         if resume:
             run.resume()
         return run.train()
@@ -274,6 +288,9 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
             say(describe_scene(scene, layout, config))
         forecast = Forecast(config, scene) if say and config.device == "cpu" else None
         run = Run(new_trainer(config, scene, rasterize, group), progress, lock, forecast)
+        room = room_text(run.trainer)
+        if say and room:
+            say(room)
         if resume:
             resumed = run.resume()
             print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")

@@ -15,14 +15,12 @@ from diff_smoe_rasterization.footprints import GATE_GRADIENTS, Footprints, blend
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 from diff_smoe_rasterization.splats import Splats
 
-from ..model import GaussianModel
+from ..model import PARAMETERS, GaussianModel
 from ..system.group import Group
 from ..training.strategy import Look
 
 _OPS = torch.ops.diff_smoe_rasterization
 _GATE = 8  # numbers of a footprint before its features
-PER_GAUSSIAN = [name for name in INPUTS if name in ("means3D", "means2D", "opacities", "dc", "shs", "scales",
-                                                    "rotations")]
 
 
 class Projected(NamedTuple):
@@ -31,7 +29,7 @@ class Projected(NamedTuple):
     inputs: Sequence[Optional[torch.Tensor]]  # of the op `project`
     options: Sequence[Any]  # likewise
     visible: torch.Tensor  # [M] int64
-    features: torch.Tensor  # [M, F]
+    features: torch.Tensor  # [N, F]
     radii: torch.Tensor  # [N] int32
 
 
@@ -64,28 +62,26 @@ class DrawnImage:
 class Batch:
     """The views of one step, from projection to gradients. View k is blended by process k of the group, in turns."""
 
-    def __init__(self, group: Group, gaussians: Dict[str, torch.Tensor],
-                 settings: Sequence[GaussianRasterizationSettings], note: int = 0) -> None:
-        """Projects this process's Gaussians, and sends their footprints.
-
-        gaussians: those arguments of a rendering that have a row for each Gaussian.
-
-        settings: of each view. note: a number; `notes` has those of all processes.
-        """
-        self.group = group
+    def __init__(self, group: Group, model: GaussianModel, settings: Sequence[GaussianRasterizationSettings],
+                 note: int = 0) -> None:
+        """Projects and sends. settings: of each view. note: a number; `notes` has those of all processes."""
+        self.group, self.model = group, model
         self.owners = [view % group.size for view in range(len(settings))]
         self.own_views = [view for view, owner in enumerate(self.owners) if owner == group.rank]
         # Order of the views in the send buffer: grouped by receiver.
         self._order = sorted(range(len(settings)), key=lambda view: self.owners[view])
+        self._values = model.activated()
+        opacities, scales, rotations = self._values
+        arguments = {**model.color_arguments(), "scales": scales, "rotations": rotations,
+                     "means2D": model.raw["means3D"]}  # only its gradient is used
         self.projected: List[Projected] = []
         packed: List[torch.Tensor] = []
         for each in settings:
-            inputs, options = projection_arguments(settings=each, means2D=gaussians["means3D"], **gaussians)
+            inputs, options = projection_arguments(each, model.raw["means3D"], opacities, **arguments)
             gates, features, radii = _OPS.project(*inputs, *options, True)
             visible = radii.nonzero().squeeze(1)
-            packed.append(_OPS.pack_footprints(gates, features, radii, visible))
-            features = features.index_select(0, visible)
             self.projected.append(Projected(inputs, (*options, True), visible, features, radii))
+            packed.append(_OPS.pack_footprints(gates, features, radii, visible))
         *rows, notes = zip(*group.gather_numbers([*map(len, packed), note], str(radii.device)))
         self.notes = list(notes)
         self._counts: List[Sequence[int]] = rows  # [view][process] how many footprints
@@ -110,11 +106,6 @@ class Batch:
                                  for view in self.own_views]))
         by_rank = [{view: next(parts) for view in self.own_views} for _ in range(self.group.size)]
         return {view: [of_rank[view] for of_rank in by_rank] for view in self.own_views}
-
-    @property
-    def radii(self) -> torch.Tensor:
-        """[N] int32 above 0 if a view shows the own Gaussian."""
-        return torch.stack([projected.radii for projected in self.projected]).amax(0)
 
     def draw(self, view: int, settings: GaussianRasterizationSettings, for_backward: bool = True) -> DrawnImage:
         """Blends one of the own views, once."""
@@ -159,46 +150,53 @@ class Batch:
         pieces = returned.split([self._counts[view][self.group.rank] for view in order])
         return [piece for _, piece in sorted(zip(order, pieces), key=lambda pair: pair[0])]
 
-    def backward(self, records: List[torch.Tensor], gradients: Dict[str, torch.Tensor]) -> List[torch.Tensor]:
-        """Writes gradients by the Gaussians, sums over the views in their order.
+    def backward(self, records: List[torch.Tensor]) -> List[torch.Tensor]:
+        """Sets the gradients of the model's parameters, sums over the views in their order.
 
-        records: what `give_back` returned; it is emptied. gradients: by argument, of its shape; rows that no view shows
-        stay as they are. Returns for each view dL/dpixel times (W / 2, H / 2), [N, 3], in rows that it shows.
+        records: what `give_back` returned; it is emptied. Returns for each view dL/dpixel times (W / 2, H / 2), [N, 3].
         """
-        seen = self.radii.nonzero().squeeze(1)
-        for gradient in gradients.values():
-            gradient.index_fill_(0, seen, 0)
+        present = [tensor is not None for tensor in self.projected[0].inputs]
+        names, wanted = gradient_places(present)
+        sums: Optional[List[torch.Tensor]] = None
         means2D: List[torch.Tensor] = []
         for projected in self.projected:
-            by_name = self._by_visible(projected, records.pop(0))
-            dense = gradients["means3D"].new_empty((len(projected.radii), 3))
-            means2D.append(dense.index_copy_(0, projected.visible, by_name.pop("means2D")))
-            for name, gradient in by_name.items():
-                gradients[name].flatten(1).index_add_(0, projected.visible, gradient.flatten(1))
+            rows = records.pop(0)
+            dense = rows.new_zeros((len(projected.radii), rows.shape[1]))
+            dense.index_copy_(0, projected.visible, rows)
+            given = [tensor for tensor in projected.inputs if tensor is not None]
+            gradients = _OPS.project_backward(dense, None, given, present, projected.features, projected.radii,
+                                              *projected.options, wanted)
+            means2D.append(gradients.pop(names.index("means2D")))
+            if sums is None:
+                sums = gradients
+            else:
+                torch._foreach_add_(sums, gradients)
+            del rows, dense, gradients  # they are as large as the parameters
+        names.remove("means2D")
+        self._set_gradients(dict(zip(names, sums or ())))
         return means2D
 
-    @staticmethod
-    def _by_visible(projected: Projected, records: torch.Tensor) -> Dict[str, torch.Tensor]:
-        """The gradients by the rows that one view shows, from those by their footprints."""
-        inputs = dict(zip(INPUTS, projected.inputs))
-        names = [name for name in PER_GAUSSIAN if inputs[name] is not None]
-        # Only these rows are read and written, which are few of all.
-        inputs.update(zip(names, _OPS.gather_rows([inputs[name] for name in names], projected.visible)))
-        present = [tensor is not None for tensor in inputs.values()]
-        radii = projected.radii.index_select(0, projected.visible)
-        gradients = _OPS.project_backward(
-            records, None, [tensor for tensor in inputs.values() if tensor is not None], present, projected.features,
-            radii, *projected.options, [name in names for name in INPUTS])
-        return dict(zip(names, gradients))
-
-
-def gaussians_of(model: GaussianModel) -> Dict[str, torch.Tensor]:
-    """A model's Gaussians as `Batch` takes them."""
-    opacities, scales, rotations = model.activated()
-    return {"means3D": model.raw["means3D"], "opacities": opacities, "scales": scales, "rotations": rotations,
-            **model.color_arguments()}
+    def _set_gradients(self, by_input: Dict[str, torch.Tensor]) -> None:
+        raw = self.model.raw
+        through = ("opacities", "scales", "rotations")
+        gradients = _OPS.activate_backward([raw[name] for name in through], list(self._values),
+                                           *(by_input[name] for name in through))
+        by_name = {"means3D": by_input["means3D"], **dict(zip(through, gradients))}
+        if self.model.active_sh_degree == 0:  # `color_arguments`
+            by_name["dc"] = by_input["shs"]
+        else:
+            by_name.update(dc=by_input["dc"], shs=by_input["shs"])
+        for name in PARAMETERS:
+            raw[name].grad = by_name.get(name)
 
 
 def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
     """All rows of the parts, copied only if there are several parts."""
     return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+
+
+def gradient_places(present: Sequence[bool]) -> Tuple[List[str], List[bool]]:
+    """The inputs of the op `project` whose gradients a step wants: their names, and which of all they are."""
+    wanted = [here and name in ("means3D", "means2D", "opacities", "dc", "shs", "scales", "rotations")
+              for name, here in zip(INPUTS, present)]
+    return [name for name, want in zip(INPUTS, wanted) if want], wanted

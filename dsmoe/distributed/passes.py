@@ -5,20 +5,18 @@ from typing import Callable, Dict, Iterator, Optional, Sequence
 
 import torch
 
-from diff_smoe_rasterization.direct import DirectRendering
-
 from ..model import GaussianModel
 from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer
 from ..scenes.images import View
 from ..system.group import Group
 from ..training.gate import LearnedGate
-from ..training.passes import Compare, DirectPasses, ViewOver
+from ..training.passes import Compare, Passes, ViewOver
 from ..training.strategy import Look, Step, look_at
-from .batch import Batch, gaussians_of
+from .batch import Batch
 
 
-class BatchPasses(DirectPasses):
+class BatchPasses(Passes):
     """Each view is blended in one of the processes; each process gets the gradients of its own Gaussians."""
 
     def __init__(self, model: GaussianModel, optimizer: GaussianOptimizer, renderer: Renderer,
@@ -31,13 +29,7 @@ class BatchPasses(DirectPasses):
     @torch.no_grad()
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()) -> Step:
         settings = [self.renderer.settings_of(shown.view.camera, shown.background) for shown in views]
-        lazy, gaussians = self._begin(), self._gaussians()
-        self._send_numbers(self._sent)
-        to_read = [DirectRendering(settings=each, **gaussians).visible_radii() for each in settings]
-        lazy.launch_catch_up(torch.stack(to_read).amax(0), self._numbers[:1])
-        lazy.end()
-        batch = self._batch = Batch(self.group, gaussians, settings, note=int(self.wants_stop()))
-        self._radii = self._stepped = batch.radii
+        batch = self._batch = Batch(self.group, self.model, settings, note=int(self.wants_stop()))
         self.asked = any(batch.notes)
         # Losses, and gradients by the background's gate.
         numbers = torch.zeros(2, len(views), device=self.model.raw["means3D"].device)
@@ -68,7 +60,7 @@ class BatchPasses(DirectPasses):
         for first in range(0, len(views), self.group.size):
             some = views[first:first + self.group.size]
             settings = [self.renderer.settings_of(view.camera) for view in some]
-            batch = Batch(self.group, gaussians_of(self.model), settings)
+            batch = Batch(self.group, self.model, settings)
             looks: Dict[int, Look] = {}
             for index in batch.own_views:
                 drawn = batch.draw(index, settings[index], for_backward=False)
@@ -79,7 +71,10 @@ class BatchPasses(DirectPasses):
     def backward(self, step: Step) -> None:
         batch, self._batch = self._batch, None  # it holds on to memory
         assert batch is not None, "render comes first"
-        means2D = batch.backward(batch.give_back(self._records), self._buffers_of_gradients())
+        means2D = batch.backward(batch.give_back(self._records))
         step.seen += [(gradients, projected.radii) for gradients, projected in zip(means2D, batch.projected)]
         if self.gate:
             self.gate.gradient.copy_(sum(self._dL_dgates.unbind(), torch.zeros_like(step.loss)))
+
+    def update(self) -> None:
+        self.optimizer.step()

@@ -14,7 +14,7 @@ from ..scenes.images import View
 from ..scenes.scene import Scene
 from ..system.group import ALONE, Group
 from ..training.trainer import Trainer
-from .batch import Batch, gaussians_of
+from .batch import Batch
 from .passes import BatchPasses
 from .shards import DividedShards
 
@@ -53,7 +53,7 @@ class BatchTrainer(Trainer):
 
         def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:
             settings = [shown.settings_of(view.camera) for view in some]
-            batch = Batch(group, gaussians_of(shown.model), settings)
+            batch = Batch(group, shown.model, settings)
             return {view: batch.draw(view, settings[view], for_backward=False).color for view in batch.own_views}
 
         def longest(seconds: float) -> float:  # all processes decide alike

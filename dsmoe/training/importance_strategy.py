@@ -154,6 +154,9 @@ class ImportanceStrategy(SteadyStrategy):
             return least, None
         return least, -(-max(0, self.overshoot() - now) // steps)
 
+    def most(self) -> int:
+        return 0 if self.options.overshoot == 0 else self.overshoot()
+
     def overshoot(self) -> int:
         """How many Gaussians growth leads to, if the gradients suffice."""
         budget = self.context.config.budget

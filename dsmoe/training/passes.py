@@ -2,8 +2,7 @@
 
 `AutogradPasses` takes any rasterizer. `DirectPasses` is for a GPU, on which a step is bound by memory traffic and by
 Python: it steps spherical harmonics lazily, makes one pass of activations and Adam, writes no gradient of what was not
-seen, and repeats steps as CUDA graphs. `BatchPasses`, in distributed/passes.py, do the same without graphs, for several
-views and processes.
+seen, and repeats steps as CUDA graphs. `BatchPasses`, in distributed/passes.py, take several views and processes.
 """
 from __future__ import annotations
 
@@ -148,7 +147,6 @@ class DirectPasses(Passes):
         self._values: List[torch.Tensor] = []  # what `activate` makes of the parameters
         self._made_of: List[Tuple[torch.Tensor, int]] = []  # these, and their versions at that time
         self._buffers: Dict[str, torch.Tensor] = {}  # gradients
-        self._captured: Optional[Captured] = None  # the step in progress, if it is
         # How many steps harmonics may have missed, then the rates of geometry and of harmonics, as the ops take them.
         self._numbers = model.stored["means3D"].new_zeros(1 + 2 * len(PARAMETERS))
 
@@ -156,18 +154,22 @@ class DirectPasses(Passes):
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()
                ) -> ViewStep:
         (shown,) = views
-        lazy = self._begin()
+        stored, lazy = self.model.stored, self.optimizer.lazy_colors()
+        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
+        self._rendered = {name: weakref.ref(tensor) for name, tensor in stored.items()}
+        self._activate()
+        steps = lazy.begin_catch_up()
         settings = self.renderer.settings_of(shown.view.camera, shown.background)
         kind = self._graphs.kind(settings, self._loss_rule(iteration), *shown)
-        self._captured = None  # of the step before: it may hold on to memory
+        self._captured: Optional[Captured] = None  # of the step before: it may hold on to memory
         self._captured = self._graphs.find(
-            [*self.model.stored.values(), lazy], kind,
-            lambda captured: self._capture(captured, settings, shown, compare))
+            [*stored.values(), lazy], kind, lambda captured: self._capture(captured, settings, shown, compare))
+        self._sent = [float(steps), *self._rates(1), *lazy.next_rates()]
+        numbers = self._numbers[:len(self._sent)]
         if self._captured:
-            numbers = self._numbers[:len(self._sent)]
             self._drawn: _Drawn = self._captured.replay_draw(numbers, self._sent, settings, *shown)
         else:
-            self._send_numbers(self._sent)
+            _OPS.set_inputs([], [], numbers, self._sent)
             self._drawn = self._draw(settings, shown, compare)
         lazy.end()
         drawn = self._drawn
@@ -178,12 +180,13 @@ class DirectPasses(Passes):
 
     @torch.no_grad()
     def backward(self, step: Step) -> None:
-        self._buffers_of_gradients()
+        stored = self.model.stored
+        self._gradients = {name: self._buffer("d" + name, stored[name]) for name in GEOMETRY}
         if self._captured:
             self._captured.replay_differentiate()
         else:
             self._differentiate(self._drawn)
-        step.seen.append((self._buffer("dmeans2D", self.model.stored["means3D"]), self._radii))
+        step.seen.append((self._buffer("dmeans2D", stored["means3D"]), self._radii))
         del self._drawn  # which holds on to memory
 
     @torch.no_grad()
@@ -201,7 +204,7 @@ class DirectPasses(Passes):
         if colors and lazy is not None:
             numbers[0], numbers[1 + 2 * len(GEOMETRY):] = lazy.begin_step()
         if numbers != self._sent:  # a hook has changed learning rates, or read the model
-            self._send_numbers(numbers)
+            _OPS.set_inputs([], [], self._numbers[:len(numbers)], numbers)
         if self._captured and geometry and colors and self._stepped is self._radii:
             self._captured.replay_update()
         else:
@@ -211,32 +214,6 @@ class DirectPasses(Passes):
                 self._step_colors(lazy, self._radii)
         if colors and lazy is not None:
             lazy.end()
-
-    def _begin(self) -> LazyAdam:
-        """The host's part of a step's beginning: `_sent` is what `_numbers` are to be."""
-        lazy = self.optimizer.lazy_colors()
-        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
-        self._rendered = {name: weakref.ref(tensor) for name, tensor in self.model.stored.items()}
-        self._activate()
-        steps = lazy.begin_catch_up()
-        self._sent = [float(steps), *self._rates(1), *lazy.next_rates()]
-        return lazy
-
-    def _send_numbers(self, numbers: List[float]) -> None:
-        _OPS.set_inputs([], [], self._numbers[:len(numbers)], numbers)
-
-    def _gaussians(self) -> Dict[str, torch.Tensor]:
-        """The arguments of a rendering that have a row for each Gaussian."""
-        stored = self.model.stored
-        colors = {argument: stored[name] for argument, name in self.model.color_sources().items()}
-        return {"means3D": stored["means3D"], **dict(zip(ACTIVATED, self._values)), **colors}
-
-    def _buffers_of_gradients(self) -> Dict[str, torch.Tensor]:
-        """The memory of the gradients by `_gaussians`."""
-        lazy = self.model.lazy
-        assert lazy is not None
-        self._gradients = {name: self._buffer("d" + name, self.model.stored[name]) for name in GEOMETRY}
-        return {**self._gradients, **dict(zip(self.model.color_sources(), lazy.gradients))}
 
     def _capture(self, captured: Captured, settings: GaussianRasterizationSettings, shown: ViewOver,
                  compare: Compare) -> None:
@@ -253,17 +230,23 @@ class DirectPasses(Passes):
         captured.capture(lambda: self._draw(settings, ViewOver(view, background), compare), self._differentiate, update)
 
     def _draw(self, settings: GaussianRasterizationSettings, shown: ViewOver, compare: Compare) -> _Drawn:
-        lazy = self.model.lazy
+        parameters, lazy = self.model.stored, self.model.lazy
         assert lazy is not None
-        gaussians = self._gaussians()
-        direct = DirectRendering(settings=settings, means2D=self._buffer("means2D", gaussians["means3D"]), **gaussians)
+        colors = {argument: parameters[name] for argument, name in self.model.color_sources().items()}
+        direct = DirectRendering(
+            parameters["means3D"], self._values[0], settings, means2D=self._buffer("means2D", parameters["means3D"]),
+            scales=self._values[1], rotations=self._values[2], **colors)
         lazy.launch_catch_up(direct.visible_radii(), self._numbers[:1])
         rendering = direct.render()
         return _Drawn(direct, rendering, *compare(shown, rendering.color))
 
     def _differentiate(self, drawn: _Drawn) -> None:
         """From the gradient by the image to those by all parameters and the gate."""
-        gradients = {**self._buffers_of_gradients(), "means2D": self._buffer("dmeans2D", self.model.stored["means3D"])}
+        stored, lazy = self.model.stored, self.model.lazy
+        assert lazy is not None
+        gradients = {name: self._buffer("d" + name, stored[name]) for name in GEOMETRY}
+        gradients.update(zip(self.model.color_sources(), lazy.gradients))
+        gradients["means2D"] = self._buffer("dmeans2D", stored["means3D"])
         if self.gate:
             gradients["background_gate"] = self.gate.gradient
         drawn.direct.backward({"color": drawn.dL_dcolor}, gradients)

@@ -116,6 +116,10 @@ class Strategy:
         """May change the first Gaussians; a resumed run replaces them and loads the state."""
         self.context = context
 
+    def most(self) -> int:
+        """How many Gaussians there will be at most; 0: nobody knows."""
+        return self.context.config.budget
+
     def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         """The loss of a rendering [3, H, W], and its gradient by it. target: floats, or bytes of 255ths."""
         squares, lambda_dssim = self.squares(iteration), self.context.config.lambda_dssim

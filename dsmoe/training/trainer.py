@@ -22,6 +22,7 @@ from .gate import LearnedGate
 from .graphs import CudaGraphs
 from .passes import AutogradPasses, DirectPasses, Passes, ViewOver
 from .randomness import ViewOrder, random_state, restore_random_state, seed_everything
+from .room import free_bytes, gaussian_bytes
 from .shards import Shards
 from .state_check import check_state
 from .strategies import STRATEGIES
@@ -92,6 +93,14 @@ class Trainer:
     def num_gaussians(self) -> int:
         """Of all processes."""
         return self.model.num_gaussians
+
+    def room(self) -> Optional[int]:
+        """About how many Gaussians fit into the GPUs of all processes, those that there are included; None on a CPU."""
+        if self.config.device == "cpu":
+            return None
+        pixels = max(view.camera.width * view.camera.height for view in self.scene.train)
+        free = [numbers[0] for numbers in self.group.gather_numbers([free_bytes(pixels)], self.config.device)]
+        return self.num_gaussians + self.group.size * min(free) // gaussian_bytes(self.config)
 
     def whole_model(self) -> Optional[GaussianModel]:
         """In the process that leads the model with the Gaussians of all, averaged if the strategy does so."""

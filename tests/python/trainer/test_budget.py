@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -19,6 +20,7 @@ from dsmoe.scenes.scene import load_scene
 from dsmoe.train import train
 from dsmoe.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
 from dsmoe.training.passes import AutogradPasses
+from dsmoe.training.room import gaussian_bytes
 from dsmoe.training.strategy import Look
 from dsmoe.training.trainer import Trainer
 
@@ -91,6 +93,40 @@ def test_growth_ends_where_memory_does(tiny_config, budget, goal):
     context = trainer.strategy.context
     trainer.strategy.context = dataclasses.replace(context, config=dataclasses.replace(context.config, budget=budget))
     assert trainer.strategy.overshoot() == goal
+
+
+@pytest.mark.parametrize("options, said", [
+    (dict(budget=60, strategy="importance"),
+     "about 500 Gaussians fit into the GPU's memory; note: --strategy importance grows to 600; take a "
+     "smaller --budget or more --gpus"),
+    (dict(budget=501, strategy="mcmc"), "about 500 .* --strategy mcmc grows to 501;"),
+    (dict(), "about 500 Gaussians fit into the GPU's memory$")], ids=["importance", "mcmc", "3dgs"])
+def test_how_many_fit_is_said_before_the_first_step(tiny_config, monkeypatch, options, said):
+    lines = []
+
+    class Begins(Exception):
+        pass
+
+    def step(self, *arguments):
+        raise Begins
+
+    assert trainer_of(tiny_config).room() is None, "a CPU says nothing"
+    monkeypatch.setattr(Trainer, "room", lambda self: 500)
+    monkeypatch.setattr(Trainer, "step", step)
+    with pytest.raises(Begins):
+        train(tiny_config.changed(**options), progress=False, say=lines.append)
+    assert re.match(said, lines[-1])
+
+
+def test_a_gaussian_takes_what_was_measured():
+    """The peaks of bonsai at 0.0002 and 0.0001, in benchmarks/RESULTS.md."""
+    for few, many in (((1_199_000, 2034), (3_012_000, 4508)), ((928_000, 1841), (2_364_000, 3918))):
+        measured = (many[1] - few[1]) * 2**20 / (many[0] - few[0])
+        assert gaussian_bytes(TrainConfig()) == pytest.approx(measured, rel=0.1)
+    # benchmarks/results/distributed_*.jsonl: two processes, the peak of one, without a densification.
+    for batch, gaussians, gib in ((2, 99_911_520, 76.1), (8, 5_550_640, 4.79)):
+        measured = gib * 2**30 / (gaussians / 2)
+        assert measured < gaussian_bytes(TrainConfig(batch=batch)) < 1.1 * measured
 
 
 @pytest.mark.parametrize("strategy, killed_at, settings", [

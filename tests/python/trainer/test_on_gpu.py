@@ -19,6 +19,8 @@ from dsmoe.system.group import ALONE
 from dsmoe.system.process import SPARE_BYTES, return_spare_memory
 from dsmoe.train import Run, train
 from dsmoe.training import graphs
+from dsmoe.training.passes import Passes
+from dsmoe.training.room import gaussian_bytes
 from dsmoe.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
@@ -136,6 +138,12 @@ def test_a_step_does_not_wait_for_the_device(config, scene, monkeypatch, options
     assert all(torch.isfinite(trainer.model.raw[name]).all() for name in PARAMETERS)
 
 
+def test_no_more_fit_than_the_gpu_has_memory_for(config, scene):
+    trainer = Trainer(config, scene)
+    size = gaussian_bytes(config)
+    assert 0.5 * torch.cuda.mem_get_info()[0] < trainer.room() * size <= torch.cuda.mem_get_info()[1]
+
+
 @pytest.mark.parametrize("strategy", ["3dgs", "steady", "importance", "mcmc"])
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_a_whole_run(config, strategy, mode):
@@ -201,6 +209,17 @@ def test_a_deterministic_training_over_batches_repeats_bit_for_bit(config, scene
     assert len(results[0]["means3D"]) != len(scene.points.positions)
     for name in PARAMETERS:
         assert torch.equal(results[0][name], results[1][name]), name
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_a_look_at_footprints_is_one_at_gaussians(config, scene, mode):
+    """The same bits, of the same image."""
+    trainer = BatchTrainer(config.changed(batch=4, deterministic=True, blend_mode=mode), scene, ALONE)
+    steps_of(trainer, 3)
+    looks = zip(Passes.look(trainer.passes, trainer.scene.train), trainer.passes.look(trainer.scene.train))
+    for usual, by_footprints in looks:
+        assert usual.costs.any() and torch.equal(usual.costs, by_footprints.costs)
+        assert usual.errors.any() and torch.equal(usual.errors, by_footprints.errors)
 
 
 def test_a_deterministic_training_to_a_budget_repeats_bit_for_bit(config, scene):
