@@ -42,6 +42,7 @@ def main(folder: Path) -> None:
                 copy(path, pages)
         write(pages / page.relative_to(ROOT), text)
     write(pages / "docs" / "site" / "cpp_headers.md", header_pages())
+    copy(SITE / "site.css", pages)
     if os.environ.get(DEMO):
         shutil.copyfile(os.environ[DEMO], pages / "docs" / "demo.html")
         look = pages / "docs" / "look.md"
