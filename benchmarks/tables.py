@@ -129,6 +129,24 @@ def recipe_table(rows: Sequence[Row]) -> str:
                         for name in ("PSNR", "SSIM", "Gaussians", "MiB"))], (line for *_, line in sorted(lines)))
 
 
+def race_table() -> str:
+    """When trainers reach a PSNR: a line for each, means over its seeds. A time is that of the first evaluation there.
+
+    A PSNR that a seed does not reach has no time.
+    """
+    bounds, lines = (30.0, 31.0, 31.5), []
+    for (trainer,), evaluations in grouped(rows_of("race_h100.jsonl"), "trainer").items():
+        runs = list(grouped(evaluations, "seed").values())
+        times = [[next((row["train_seconds"] for row in run if row["psnr"] >= bound), math.nan) for run in runs]
+                 for bound in bounds]
+        ends = [run[-1] for run in runs]
+        reached = ["–" if math.isnan(sum(seconds)) else f"{statistics.fmean(seconds):.1f}" for seconds in times]
+        lines.append([trainer, str(len(runs)), *reached, f"{mean(ends, 'train_seconds'):.1f}",
+                      f"{ends[0]['iteration']:,}", thousands(ends), f"{mean(ends, 'psnr'):.2f}"])
+    return table(["trainer", "seeds", *(f"s to {bound} dB" for bound in bounds), "s in all", "iterations", "Gaussians",
+                  "PSNR"], lines)
+
+
 def rules_table() -> str:
     """The recipe by Eq. 7 and by smoe without a gate."""
     rows = [row for row in rows_of("tails_h100.jsonl") if row["strategy"] == "3dgs"]
@@ -188,7 +206,7 @@ def main() -> None:
     parser.add_argument("--figure", metavar="PNG", help="draw it here")
     options = parser.parse_args()
     rows = trainings()
-    for text in (readme_table(rows), budget_table(rows), recipe_table(rows), rules_table()):
+    for text in (readme_table(rows), budget_table(rows), recipe_table(rows), rules_table(), race_table()):
         print(text, end="\n\n")
     if options.figure:
         draw(options.figure)

@@ -238,8 +238,6 @@ def _can_train(scene: Values, method: Values, axes: Axes) -> None:
            "`steady` there")
     refuse(scene["init_points"],
            f"{what}: init_points is {scene['init_points']}, but checkouts start from all points")
-    refuse(LEARNED in axes["background_gates"] and method["variant"] != "unpatched",
-           f"{what}: background_gates: {LEARNED!r} is only for the native trainer; it must be a number")
     refuse(axes["budgets"] != [0], f"{what}: budgets: are only for the native trainer; leave them out")
     refuse(name in COUNTED_BY and len(thresholds) > 1,
            f"{what}: {name} has no threshold ({COUNTED_BY.get(name)} stands for it): {len(thresholds)} of them would "

@@ -188,7 +188,6 @@ def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
      "lego is white"),
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "init_points": 10}]}, "3dgs-2023: init_points is 10"),
     ("3dgs-2023", {"budgets": [500]}, "budgets: are only for the native trainer"),
-    ("3dgs-2023", {"background_gates": ["learned"]}, "background_gates: 'learned' is only for the native"),
     *((name, {"protocol": {"options": {option: value}}}, rf"protocol.options.{option}: {name} \(methods\[1\]\)")
       for name, option, value in (("3dgs-2023", "antialiasing", True), ("taming", "feature_lr", 0.01),
                                   ("hac", "opacity_reset_interval", 500), ("hac-plus", "sh_degree", 2),
