@@ -162,7 +162,8 @@ class Run:
         self.scalars.add(trainer.iteration, loss=loss, psnr=quality, gaussians=count, **gate)
         if self.progress:
             shown = {name: f"{value:.4f}" for name, value in gate.items()}
-            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{quality:.2f}", **shown, gaussians=count, refresh=False)
+            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{quality:.2f}", **shown, gaussians=f"{count:,}",
+                            refresh=False)  # a number would become 3e+4
 
     def _evaluate(self, bar: Any) -> None:
         trainer = self.trainer

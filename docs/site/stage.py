@@ -42,11 +42,12 @@ def main(folder: Path) -> None:
                 copy(path, pages)
         write(pages / page.relative_to(ROOT), text)
     write(pages / "docs" / "site" / "cpp_headers.md", header_pages())
+    copy(SITE / "site.css", pages)
     if os.environ.get(DEMO):
         shutil.copyfile(os.environ[DEMO], pages / "docs" / "demo.html")
-        look = pages / "docs" / "look.md"
-        title, text = look.read_text(encoding="utf-8").split("\n", 1)
-        look.write_text(f"{title}\n\n[A model to look at here](demo.html).\n{text}", encoding="utf-8")
+        for page, target in (("README.md", "docs/demo.html"), ("docs/look.md", "demo.html")):
+            title, text = (pages / page).read_text(encoding="utf-8").split("\n", 1)
+            write(pages / page, f"{title}\n\n[A model to turn with the mouse]({target}).\n{text}")
     settings = (SITE / "mkdocs.yml").read_text(encoding="utf-8")
     write(folder / "mkdocs.yml", settings.replace("REPOSITORY", str(ROOT)))
 

@@ -10,6 +10,7 @@ import numpy as np
 from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
+from ..system.process import pip_install
 from .rows import rotatable_rows, y_up
 
 # Bits behind the point of a coordinate, which has 24 bits. The fewest reach to 8192 units, in steps of a thousandth.
@@ -21,7 +22,8 @@ def check_spz() -> None:
     try:
         import gsply  # noqa: F401
     except ImportError as error:
-        raise TrainerError("for .spz gsply is needed (pip install gsply); it needs Python 3.10 or later") from error
+        raise TrainerError(f"for .spz gsply is needed: {pip_install('gsply')}; it needs Python 3.10 or "
+                           "later") from error
 
 
 def spz_bytes(gaussians: Gaussians) -> bytes:

@@ -203,6 +203,7 @@ def test_the_site_shows_the_page_that_is_named(stage, tmp_path, monkeypatch):
     docs = tmp_path / "site" / "pages" / "docs"
     assert (docs / "demo.html").read_text(encoding="utf-8") == "<p>a model</p>"
     assert "](demo.html)" in (docs / "look.md").read_text(encoding="utf-8")
+    assert "](docs/demo.html)" in (docs.parent / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

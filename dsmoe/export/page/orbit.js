@@ -16,7 +16,7 @@ function turned(v, axis, angle) {
 class Orbit {
   // up: unit vector of the world; target: the point that the camera turns about. changed(): called after each move.
   constructor(canvas, up, target, changed) {
-    this.up = up, this.target = target, this.changed = changed;
+    this.canvas = canvas, this.up = up, this.target = target, this.changed = changed;
     const fingers = new Map();
     canvas.style.touchAction = "none";
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -36,7 +36,7 @@ class Orbit {
         const apart = (finger) => Math.hypot(finger.clientX - other.clientX, finger.clientY - other.clientY);
         this.zoom(apart(before) / Math.max(1, apart(event)));
       } else if (event.buttons & 2 || event.shiftKey) {
-        this.shift(x / canvas.clientHeight, y / canvas.clientHeight);
+        this.shift(x, y);
       } else {
         this.turn(4 * x / canvas.clientHeight, 4 * y / canvas.clientHeight);
       }
@@ -71,10 +71,10 @@ class Orbit {
     this.rotation = this.rotation.map((row) => turned(row, axis, angle));
   }
 
-  // By parts of the image's height, at the target's depth.
+  // By pixels of the page, at the target's depth.
   shift(x, y) {
     const depth = Math.abs(dot(this.rotation[2], plus(this.target, this.eye, -1)));
-    const scale = depth * this.camera.height / this.camera.fy;
+    const scale = depth / this.forImage(this.canvas.clientWidth, this.canvas.clientHeight).fy;
     const move = plus(this.rotation[0].map((value) => -x * scale * value), this.rotation[1], -y * scale);
     this.eye = plus(this.eye, move), this.target = plus(this.target, move);
     this.changed();
@@ -86,9 +86,9 @@ class Orbit {
     this.changed();
   }
 
-  // The camera of an image of this size in pixels; the view's height stays.
+  // The camera of an image of this size in pixels; the whole view is in it, and more beside it or above and below.
   forImage(width, height) {
-    const {camera} = this, scale = height / camera.height;
+    const {camera} = this, scale = Math.min(width / camera.width, height / camera.height);
     return {rotation: this.rotation, translation: this.translation, fx: camera.fx * scale, fy: camera.fy * scale,
             cx: width / 2 + (camera.cx - camera.width / 2) * scale,
             cy: height / 2 + (camera.cy - camera.height / 2) * scale};

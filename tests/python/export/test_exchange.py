@@ -252,7 +252,7 @@ def test_an_spz_without_gsply_is_refused_with_the_command_that_helps(export, tmp
     model, path = str(tmp_path / "trained.ply"), tmp_path / "model.spz"
     io.write_gaussians(model, cloud())
     assert main(["export", model, "-o", str(path)]) == 1
-    assert "for .spz gsply is needed (pip install gsply)" in capsys.readouterr().err and not path.exists()
+    assert "pip install gsply; it needs Python 3.10" in capsys.readouterr().err and not path.exists()
 
 
 def test_a_glb_of_more_than_4_GiB_is_refused(monkeypatch):

@@ -63,6 +63,11 @@ def test_a_browser_shows_what_is_rendered(browser, tmp_path, mode, gate, degree,
     with torch.no_grad():
         rendered = Renderer(model, mode, torch.tensor(background), antialiasing, background_gate=gate)(camera).color
     assert psnr(picture, to_image(rendered)) >= LEAST_PSNR
+    browser.value("delete document.body.dataset.drawn, 0")
+    browser("Emulation.setDeviceMetricsOverride", width=160, height=248, deviceScaleFactor=1, mobile=False)
+    browser.wait_until("document.body.dataset.drawn === 'true'")
+    tall = browser.picture().crop((0, 64, 160, 184))  # a multiple of 16: tails depend on tiles
+    assert psnr(tall, to_image(rendered)) >= LEAST_PSNR, "a tall window has the whole view in its middle"
     other = "smoe_eq7" if mode == "alpha" or gate == 1 else "alpha"
     with torch.no_grad():
         wrong = Renderer(model, other, torch.tensor(background), antialiasing, background_gate=0.1)(camera).color
