@@ -15,6 +15,7 @@ from typing import Any, Dict, Iterable, List, Sequence, Tuple
 Row = Dict[str, Any]
 RESULTS = Path(__file__).resolve().parent / "results"
 BLENDS = ("alpha", "smoe")
+TARGETS = (30.0, 31.0, 31.5)  # dB, of trainings side by side
 SCENES = ("bonsai", "fox", "office_table", "room35", "lego")
 
 
@@ -79,6 +80,30 @@ def figures(rows: Sequence[Row]) -> List[str]:
 def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *lines)).replace(
         " --- ", "---")
+
+
+def race_table() -> str:
+    """Seconds of training until the PSNR is first as high.
+
+    A run with three rows has one for each target, with its PSNR in brackets if that is lower.
+    """
+    lines = []
+    kinds = grouped(rows_of("race_h100.jsonl"), "trainer", "preset", "blend_mode", "budget")
+    for (trainer, preset, blend, budget), cells in kinds.items():
+        name = f"`dsmoe train`, {blend}, {f'`{preset}`' if preset else f'N = {budget:,}'}" if budget else (
+            f"{trainer}, {preset}")
+        runs = list(grouped(cells, "seed").values())
+        line = [name, thousands([run[-1] for run in runs])]
+        for target in TARGETS:
+            reached = [next((row for row in run if row["psnr"] >= target), None) for run in runs]
+            line.append(f"{mean(reached, 'train_seconds'):.1f}" if None not in reached else "–")
+            if len(runs[0]) == len(TARGETS):  # one row for each
+                row = runs[0][TARGETS.index(target)]
+                line[-1] = f"{row['train_seconds']:.1f}" + f" ({row['psnr']:.2f})" * (row["psnr"] < target)
+        ends = [run[-1] for run in runs]
+        lines.append([*line, f"{mean(ends, 'train_seconds'):.1f}", shown(ends, "psnr", 2), str(len(runs))])
+    return table(["trainer", "Gaussians", *(f"s to {target} dB" for target in TARGETS), "s to the end", "PSNR", "runs"],
+                 lines)
 
 
 def budget_table(rows: Sequence[Row]) -> str:
@@ -188,7 +213,7 @@ def main() -> None:
     parser.add_argument("--figure", metavar="PNG", help="draw it here")
     options = parser.parse_args()
     rows = trainings()
-    for text in (readme_table(rows), budget_table(rows), recipe_table(rows), rules_table()):
+    for text in (race_table(), readme_table(rows), budget_table(rows), recipe_table(rows), rules_table()):
         print(text, end="\n\n")
     if options.figure:
         draw(options.figure)
