@@ -96,9 +96,6 @@ class DividedShards(Shards):
         begin = sum(counts[:self.group.rank])
         return function(sum(counts))[:, begin:begin + count]
 
-    def arrange(self, rows: torch.Tensor, means: torch.Tensor) -> torch.Tensor:
-        return rows  # `settle` needs the kinds one behind the other
-
     def settle(self, kinds: torch.Tensor) -> None:
         own = torch.bincount(kinds, minlength=KINDS)
         of_rank = torch.tensor(self.group.gather_numbers(own.tolist(), str(kinds.device)), device=kinds.device)

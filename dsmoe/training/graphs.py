@@ -11,6 +11,7 @@ import dataclasses
 import gc
 import math
 import sys
+import warnings
 import weakref
 from typing import Any, Callable, Dict, Hashable, Iterator, List, Optional, Sequence, Tuple
 
@@ -240,7 +241,8 @@ class CudaGraphs(Graphs):
             try:
                 function()
             except BaseException:  # it says what is wrong; the end of a broken capture would say less
-                with contextlib.suppress(RuntimeError):
+                with contextlib.suppress(RuntimeError), warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # torch's, that the graph is empty
                     graph.capture_end()
                 raise
             graph.capture_end()

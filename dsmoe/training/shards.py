@@ -5,10 +5,6 @@ from typing import Callable, NamedTuple
 
 import torch
 
-BITS = 21  # of a coordinate: three of them fill an int64
-SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-          (2, 0x1249249249249249))  # shifts and masks that move bit i of a number to bit 3 i
-
 
 class Route(NamedTuple):
     """Pairs of a Gaussian and a place, which takes something of it: what a process has of them."""
@@ -16,19 +12,6 @@ class Route(NamedTuple):
     origins: torch.Tensor  # own rows from which something goes, as often as it does
     places: torch.Tensor  # own rows to which something comes
     send: Callable[[torch.Tensor], torch.Tensor]  # from a row for each of `origins` to one for each of `places`
-
-
-def z_order(points: torch.Tensor) -> torch.Tensor:
-    """Indices [N] of points [N, 3] along a Z-order curve (Morton 1966) through the box around them.
-
-    A view shows runs of neighbours. So kernels read few cache lines of which they need only a part.
-    """
-    low, high = points.amin(0), points.amax(0)
-    codes = ((points - low) / (high - low).clamp(min=1e-30) * (2**BITS - 1)).long()
-    for shift, mask in SPREAD:
-        codes = (codes | (codes << shift)) & mask
-    x, y, z = codes.unbind(1)
-    return (x | (y << 1) | (z << 2)).sort(stable=True).indices
 
 
 class Shards:
@@ -64,10 +47,6 @@ class Shards:
     def draw(self, function: Callable[[int], torch.Tensor], count: int) -> torch.Tensor:
         """This process's part of what function(total) draws for all things: [K, total, ...] -> [K, count, ...]."""
         return function(count)
-
-    def arrange(self, rows: torch.Tensor, means: torch.Tensor) -> torch.Tensor:
-        """In which order the rows [M] of Gaussians that stay are kept. means: [N, 3] of all Gaussians, world."""
-        return rows[z_order(means.index_select(0, rows))] if len(rows) > 0 else rows
 
     def settle(self, kinds: torch.Tensor) -> None:
         """Puts the Gaussians in order once some were added or removed: by kind, within a kind as they lie.

@@ -247,18 +247,13 @@ class ThreeDGSStrategy(Strategy):
         return raw["means3D"] + turned, torch.log(scales / SPLIT_SHRINK)
 
     def prune(self, large_too: bool) -> torch.Tensor:
-        """Removes faint Gaussians and, if asked, those larger than a tenth of the scene.
-
-        Returns the rows that stay, [M] int64, in the order in which they stay.
-        """
+        """Removes faint Gaussians and, if asked, those larger than a tenth of the scene. Returns which stay, [N]."""
         model = self.context.model
         doomed = model.opacities.detach().squeeze(1) < MIN_OPACITY
         if large_too:
             doomed |= model.scales.detach().max(dim=1).values > MAX_SCALE * self.context.extent
-        kept = (~doomed).nonzero().squeeze(1)  # on a GPU the host waits here, once for all tensors
-        kept = self.context.shards.arrange(kept, model.raw["means3D"].detach())
-        self.context.optimizer.take(kept)
-        return kept
+        self.context.optimizer.keep(~doomed)
+        return ~doomed
 
     def reset_opacities(self) -> None:
         """Lowers every opacity to at most RESET_OPACITY."""

@@ -32,7 +32,8 @@ template <class S> struct Column {
   // column: counted over all tensors.
   __device__ Column(const LazyAdam<S>& adam, int column) {
     tensor = 0, place = column;
-    while (tensor < adam.num_tensors && place >= adam.tensors[tensor].row_size) place -= adam.tensors[tensor++].row_size;
+    while (tensor < adam.num_tensors && place >= adam.tensors[tensor].row_size)
+      place -= adam.tensors[tensor++].row_size;
     exists = tensor < adam.num_tensors;
     if (!exists) tensor = place = 0;
   }

@@ -8,8 +8,8 @@
 namespace dsmoe {
 namespace cuda {
 
-// A warp that takes up to 32 rows takes fewer where a multiprocessor would get less than this many warps: half of the 64
-// that it can hold, enough to hide the latency of loads.
+// A warp that takes up to 32 rows takes fewer where a multiprocessor would get less than this many warps: half of the
+// 64 that it can hold, enough to hide the latency of loads.
 constexpr int kEnoughWarpsPerMultiprocessor = 32;
 
 // How many rows a warp takes: 32, 16, ... or `least`.
