@@ -38,11 +38,12 @@ COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", 
 
 
 def restore_links(root):
-    """Makes the links anew that a .zip of the tree holds as text, which pip and Python's zipfile unpack as such."""
+    """Makes the links anew: pip and Python's zipfile unpack those of a .zip as text, and an sdist holds none."""
     for link, target in LINKS.items():
         path = Path(root, link)
         if path.is_file():
             path.unlink()
+        if not path.exists():
             path.symlink_to(target, target_is_directory=True)
 
 

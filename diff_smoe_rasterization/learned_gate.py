@@ -2,7 +2,7 @@
 
 `background_gate="learned"` in the settings of a rendering takes it. The gate steps with the optimizer that holds the
 centres of the Gaussians; where none holds them, as they are computed, with the first that steps after a backward pass.
-Of an optimizer that is none of torch's it learns at the next rendering, by the centres that have changed.
+Of an optimizer that is none of torch's it learns at the next rendering, by the centres that have changed in place.
 """
 from __future__ import annotations
 
@@ -125,7 +125,10 @@ class ProcessGate:
         if means3D is not None:
             self._watch(means3D)
         # A tensor of its own for each rendering: a step between it and its backward pass changes none of them.
-        return self._value.clone().to(like)
+        value = self._value.clone()
+        if self._found == 0:  # the logarithm cannot begin there: until the first step 0 is rendered
+            value = value - self._value.detach()
+        return value.to(like)
 
     def _begin(self) -> None:
         self._learns = True
@@ -137,19 +140,23 @@ class ProcessGate:
     def _watch(self, means3D: torch.Tensor) -> None:
         """Notes whose step the gate waits for.
 
-        A gradient may wait that no optimizer of torch took. Where the centres were changed in place, an optimizer of
-        another kind has stepped. Where their gradient is gone, or they are, the trainer dropped it.
+        A gradient may wait that no optimizer of torch took. Where the centres were changed in place, and none of torch
+        is known to hold them, an optimizer of another kind has stepped. Where their gradient is gone or all 0, or they
+        are gone, the trainer dropped it.
         """
         if not means3D.is_leaf or not means3D.requires_grad:
             self._centres = None
             return
         before: Any = None if self._centres is None else self._centres()
         gradient = self._value.grad
-        if gradient is not None and before is means3D and means3D._version != self._version:
+        if gradient is not None and before is means3D and means3D._version != self._version and (
+                self._holder is None or self._holder() is None):
             self._step(gradient)
             self._value.grad = None
         elif self._centres is not None and (before is None or before is means3D and means3D.grad is None):
             self._value.grad = None
+        elif gradient is not None and before is means3D:
+            gradient *= means3D.grad.any()  # zero_grad(set_to_none=False); the host does not wait
         self._centres, self._version = weakref.ref(means3D), means3D._version
 
     def _after_step(self, optimizer: Any, *_: Any) -> None:
@@ -157,9 +164,10 @@ class ProcessGate:
         if gradient is None:
             return
         centres = None if self._centres is None else self._centres()
-        if centres is not None and any(one is centres for group in optimizer.param_groups for one in group["params"]):
-            self._holder = weakref.ref(optimizer)
         holder = None if self._holder is None else self._holder()
+        if optimizer is not holder and centres is not None and any(
+                one is centres for group in optimizer.param_groups for one in group["params"]):
+            holder, self._holder = optimizer, weakref.ref(optimizer)
         # Densification may have replaced the centres by others before the step. Where their optimizer is not known, one
         # that steps a second time is as good.
         if self._centres is None or optimizer is holder or (

@@ -53,9 +53,9 @@ def build_parser() -> argparse.ArgumentParser:
     earlier_run.add_argument("--overwrite", action="store_true",
                              help="replace the run in OUT, once this one can start; other files there stay")
     groups["run"].add_argument(
-        "--gpus", type=int, metavar="N",
+        "--gpus", metavar="N",
         help="train on so many GPUs of this machine: torchrun starts this command once for each; with --batch N or "
-             "more")
+             "more. auto: on all of them, but on no more than --batch keeps busy")
     groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
 
     scene = commands.add_parser("scene", help="make a scene of photographs",
@@ -87,7 +87,7 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
     render.add_argument("-o", "--output", metavar="DIR|VIDEO", required=True,
                         help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
-                             "that ends in .mp4 (needs imageio-ffmpeg) or .gif")
+                             "that ends in .mp4 (needs imageio-ffmpeg), .gif or .webp")
     render.add_argument("--orbit", action="store_true", help="once around what the scene's cameras look at")
     render.add_argument("--frames", type=int, default=choices.ORBIT_FRAMES, metavar="N",
                         help="of an orbit (default: %(default)s)")

@@ -127,10 +127,9 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
             arguments.command_words += ["--device", "cuda"]
     config = _train_config(arguments)
     if gpus is not None:
-        from .system.torchrun import check_gpus, launch, without_gpus
+        from .system.torchrun import chosen_gpus, launch, without_gpus
 
-        check_gpus(gpus, config.device)
-        return launch(gpus, without_gpus(arguments.command_words))
+        return launch(chosen_gpus(gpus, config.device, config.batch), without_gpus(arguments.command_words))
     check_device(config.device)
     set_up_process(config.device)
     group = join_group(config.device)

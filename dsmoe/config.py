@@ -25,7 +25,6 @@ from .system.files import is_file, is_folder, write_text_atomically
 CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.pt"  # beside it
 STRATEGY_NAMES = ("3dgs", "steady", "importance", "mcmc")
-BATCHED = ("3dgs", "steady")  # the strategies that train on batches of views, and on several GPUs
 IMAGES = "images"  # folder of a COLMAP scene
 PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
@@ -156,9 +155,6 @@ class TrainConfig:
         self._require("iterations", self.iterations >= 1, "at least 1")
         self._require("batch", self.batch >= 1, "at least 1")
         self._require("iterations", self.iterations % self.batch == 0, f"a multiple of --batch, {self.batch}")
-        if self.batch > 1 and self.strategy not in BATCHED:
-            raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.strategy}: only "
-                              f"{' and '.join(BATCHED)} know batches")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
@@ -207,8 +203,8 @@ class TrainConfig:
     def changed(self, **options: Any) -> TrainConfig:
         """A validated copy with some options set.
 
-        Another blend mode takes its own background gate, also of how that is learned what is at its default. Another
-        strategy takes what of the recipe is at its default and its own options.
+        Another blend mode brings its default gate, and its defaults of learning one in place of the old mode's. Another
+        strategy brings its defaults of the recipe in place of the old one's, and drops the old one's own options.
         """
         return self._changed(options).validate()
 

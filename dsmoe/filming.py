@@ -19,8 +19,8 @@ def film(trained: Trained, path: str, frames: int = ORBIT_FRAMES, fps: float = V
          overwrite: bool = False) -> str:
     """Goes once around the scene and writes what is seen; returns a line that says what was written.
 
-    path: a file that ends in .mp4 or .gif, else a folder for PNGs as `render_images` takes it. outputs: further images
-    in such a folder. overwrite: files that are there may be replaced. Raises TrainerError.
+    path: a file that ends in .mp4, .gif or .webp, else a folder for PNGs as `render_images` takes it. outputs: further
+    images in such a folder. overwrite: files that are there may be replaced. Raises TrainerError.
     """
     if frames < 1:
         raise TrainerError(f"--frames is {frames}; it must be at least 1")

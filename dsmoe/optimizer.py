@@ -123,10 +123,11 @@ class GaussianOptimizer:
         self._replace("opacities", lambda tensor, new: new.clone(), logits)
 
     @torch.no_grad()
-    def overwrite(self, rows: torch.Tensor, raw: Dict[str, torch.Tensor], like: Optional[torch.Tensor] = None) -> None:
+    def overwrite(self, rows: torch.Tensor, raw: Dict[str, torch.Tensor],
+                  squares: Optional[Callable[[torch.Tensor], torch.Tensor]] = None) -> None:
         """Puts Gaussians, raw parameters as in PARAMETERS, in place of those in other rows [M], which differ.
 
-        Their moments start at zero; like: rows [M] whose second moments they take over instead.
+        Their moments start at zero. squares: from the second moments of all, [N, ...], to those that they begin with.
         """
         for name in PARAMETERS:
             tensor = self.model.raw[name]
@@ -136,12 +137,12 @@ class GaussianOptimizer:
             state = self.adam.state.get(tensor)
             if not state:
                 continue
-            squares = state["exp_avg_sq"]
+            second = state["exp_avg_sq"]
             state["exp_avg"].index_fill_(0, rows, 0)
-            if like is None:
-                squares.index_fill_(0, rows, 0)
+            if squares is None:
+                second.index_fill_(0, rows, 0)
             else:
-                squares.index_copy_(0, rows, squares.index_select(0, like))
+                second.index_copy_(0, rows, squares(second))
 
     def rearrange(self, edit: Callable[[torch.Tensor], torch.Tensor]) -> None:
         """Puts edit(rows) in place of every parameter and every moment."""

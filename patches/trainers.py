@@ -1,7 +1,7 @@
-"""The trainers that can be patched, as a table. It has names and structure, no line of a trainer.
+"""The trainers that can be patched, as a table: names and structure, no line of their code.
 
-A checkout is the first trainer of TRAINERS that calls the rasterizer it calls and whose signs it shows; facts.py says
-what signs are. integrations/contracts.py is the table of rasterizers.
+A checkout is recognised as the first entry of TRAINERS whose rasterizer it calls and whose signs it shows. facts.py
+says what signs are; integrations/contracts.py is the table of rasterizers.
 """
 from __future__ import annotations
 

@@ -5,7 +5,7 @@
 One process without torchrun takes the same steps. The model is one that `models.from_npz` reads, or --copies of it,
 each moved by noise and made smaller, so that all together cover what one did. Targets are renderings of the model, but
 lighter. The first process prints and writes a row: images a second and peak memory of each process. With --digest it
-has checksums of the gradients, which with --deterministic are the same for any number of processes.
+has checksums of moments and parameters, which with --deterministic are the same for any number of processes.
 """
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from dsmoe.config import TrainConfig
-from dsmoe.distributed.batch import Batch
+from dsmoe.distributed.batch import Batch, gaussians_of
 from dsmoe.distributed.shards import run_of
 from dsmoe.distributed.trainer import BatchTrainer
 from dsmoe.scenes.images import View
@@ -78,7 +78,7 @@ def render_targets(trainer: BatchTrainer) -> None:
     views = trainer.scene.train
     for index, view in enumerate(views):
         settings = trainer.renderer.settings_of(view.camera)
-        batch = Batch(trainer.group, trainer.model, [settings])
+        batch = Batch(trainer.group, gaussians_of(trainer.model), [settings])
         image = torch.zeros_like(view.image)
         if batch.own_views:
             color = batch.draw(0, settings, for_backward=False).color
@@ -89,10 +89,11 @@ def render_targets(trainer: BatchTrainer) -> None:
 
 
 def digest(trainer: BatchTrainer) -> Dict[str, str]:
-    """A checksum of all gradients and all parameters, in the first process."""
-    sums = {"gradients": hashlib.sha256(), "parameters": hashlib.sha256()}
-    for tensor in trainer.model.raw.values():
-        for rows, of in ((tensor.grad, "gradients"), (tensor.detach(), "parameters")):
+    """A checksum of Adam's first moments, which are sums of gradients, and of all parameters, in the first process."""
+    sums = {"moments": hashlib.sha256(), "parameters": hashlib.sha256()}
+    states = trainer.optimizer.state_dict()
+    for name, tensor in trainer.model.raw.items():
+        for rows, of in ((states[name]["exp_avg"], "moments"), (tensor.detach(), "parameters")):
             whole = trainer.divided.whole(rows)
             if whole is not None:
                 sums[of].update(whole.cpu().contiguous().numpy().tobytes())
@@ -107,10 +108,9 @@ def measure(options: argparse.Namespace, group: Any) -> Dict[str, Any]:
                            "processes": group.size, "batch": options.batch, "blend_mode": options.blend_mode,
                            "deterministic": options.deterministic}
     if options.digest:
-        seen: Dict[str, str] = {}
         for _ in range(3):  # the third step's gradients depend on the two before
-            trainer.step(lambda: seen.update(digest(trainer)))
-        row["digest"] = seen
+            trainer.step()
+        row["digest"] = digest(trainer)
     forget_peak(options.device)
     for _ in range(options.warmup):
         trainer.step()
@@ -153,7 +153,7 @@ def main() -> None:
     parser.add_argument("--warmup", type=int, default=5, help="steps before those that are timed")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--deterministic", action="store_true")
-    parser.add_argument("--digest", action="store_true", help="checksums of the third step's gradients and parameters")
+    parser.add_argument("--digest", action="store_true", help="checksums after the third step")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda")
     parser.add_argument("--json", help="file to which the row is added")
     options = parser.parse_args()

@@ -13,7 +13,7 @@ import yaml
 
 from diff_smoe_rasterization.settings import GATED_MODES, resolve_background_gate
 
-from ..config import BATCHED, LEARNED
+from ..config import LEARNED
 from ..errors import ConfigError
 from . import schema
 from .errors import BenchError
@@ -99,7 +99,7 @@ def expand(content: Any, folder: str, device: Optional[str] = None) -> Suite:
         axes = {axis: {**content, **scene["axes"], **method["axes"]}[axis] for axis in AXIS_OF}
         if method["name"] != NATIVE:
             _can_train(scene, method, axes)
-        _can_divide(protocol, method, axes)
+        _can_divide(protocol, method)
         cells += _cells(content, protocol, scene, method, axes)
     for cell in cells:
         try:
@@ -238,8 +238,6 @@ def _can_train(scene: Values, method: Values, axes: Axes) -> None:
            "`steady` there")
     refuse(scene["init_points"],
            f"{what}: init_points is {scene['init_points']}, but checkouts start from all points")
-    refuse(LEARNED in axes["background_gates"] and method["variant"] != "unpatched",
-           f"{what}: background_gates: {LEARNED!r} is only for the native trainer; it must be a number")
     refuse(axes["budgets"] != [0], f"{what}: budgets: are only for the native trainer; leave them out")
     refuse(name in COUNTED_BY and len(thresholds) > 1,
            f"{what}: {name} has no threshold ({COUNTED_BY.get(name)} stands for it): {len(thresholds)} of them would "
@@ -247,15 +245,12 @@ def _can_train(scene: Values, method: Values, axes: Axes) -> None:
            "cells")
 
 
-def _can_divide(protocol: Values, method: Values, axes: Axes) -> None:
+def _can_divide(protocol: Values, method: Values) -> None:
     for field in ("batch", "gpus"):
         if protocol.get(field, 1) == 1:
             continue
         what = f"protocol.{field} is {protocol[field]}"
         refuse(method["name"] != NATIVE, f"{what}, but method {method['label']} knows none; only {NATIVE} does")
-        for strategy in axes["strategies"]:
-            refuse(strategy not in BATCHED,
-                   f"{what}, but strategy {strategy} knows none; only {' and '.join(BATCHED)} do")
     refuse(protocol.get("gpus", 1) > 1 and protocol["device"] != "cuda",
            f"protocol.gpus is {protocol.get('gpus')}; it needs protocol.device: cuda")
 

@@ -12,7 +12,7 @@ import torch
 from ..model import GaussianModel
 from ..optimizer import GaussianOptimizer
 from ..system.group import Group
-from ..training.shards import Shards
+from ..training.shards import Route, Shards
 
 KINDS = 4  # of Gaussians, at most, that a densification leaves
 
@@ -45,8 +45,7 @@ class DividedShards(Shards):
 
     def own_rows(self, rows: torch.Tensor) -> torch.Tensor:
         """This process's run of rows of all Gaussians, on the model's device."""
-        begin = sum(self.counts[:self.group.rank])
-        own = rows[begin:begin + self.counts[self.group.rank]]
+        own = rows[self.begin:self.begin + self.counts[self.group.rank]]
         return own.to(self.model.raw["means3D"].device, copy=True)  # a copy, so that the others' rows can go
 
     def whole(self, rows: torch.Tensor) -> Any:
@@ -57,17 +56,40 @@ class DividedShards(Shards):
     def num_gaussians(self) -> int:
         return sum(self.counts)
 
+    @property
+    def begin(self) -> int:
+        """The first of this process's Gaussians."""
+        return sum(self.counts[:self.group.rank])
+
     def total(self, count: int) -> int:
-        return sum(self._counts_of(count))
+        return self.num_gaussians
 
     def _counts_of(self, count: int) -> List[int]:
         device = str(self.model.raw["means3D"].device)
         return [numbers[0] for numbers in self.group.gather_numbers([count], device)]
 
-    def over_all(self, function: Callable[[torch.Tensor], torch.Tensor], values: torch.Tensor) -> torch.Tensor:
-        every = function(self.group.all_rows(values, self.counts))
-        begin = sum(self.counts[:self.group.rank])
-        return every[begin:begin + len(values)]
+    def every(self, rows: torch.Tensor) -> torch.Tensor:
+        return self.group.all_rows(rows, self.counts)
+
+    def decide(self, function: Callable[..., torch.Tensor], *values: torch.Tensor) -> torch.Tensor:
+        # By the first process's result: on a GPU a sum may be rounded otherwise in each.
+        return self.group.of_first(function(*map(self.every, values)))
+
+    def route(self, origins: torch.Tensor, places: torch.Tensor) -> Route:
+        rank, size = self.group.rank, self.group.size
+        senders, receivers = self._owners(origins), self._owners(places)
+        leaving, arriving = (senders == rank).nonzero().squeeze(1), (receivers == rank).nonzero().squeeze(1)
+        leaving = leaving[receivers[leaving].sort(stable=True).indices]
+        arriving = arriving[senders[arriving].sort(stable=True).indices]
+        sent = torch.bincount(receivers[leaving], minlength=size).tolist()
+        received = torch.bincount(senders[arriving], minlength=size).tolist()
+        return Route(origins[leaving] - self.begin, places[arriving] - self.begin,
+                     lambda rows: self.group.exchange(rows, sent, received))
+
+    def _owners(self, rows: torch.Tensor) -> torch.Tensor:
+        """The processes that have these rows of all Gaussians."""
+        ends = torch.tensor(self.counts, device=rows.device).cumsum(0)
+        return torch.bucketize(rows.contiguous(), ends, right=True)
 
     def draw(self, function: Callable[[int], torch.Tensor], count: int) -> torch.Tensor:
         counts = self._counts_of(count)
@@ -82,8 +104,7 @@ class DividedShards(Shards):
         begins = (by_kind.cumsum(0) - by_kind).view(KINDS, -1)[:, self.group.rank]
         places = begins[kinds] + torch.arange(len(kinds), device=kinds.device) - (own.cumsum(0) - own)[kinds]
         self.counts = self._even_counts(int(of_rank.sum()))
-        ends = torch.tensor(self.counts, device=kinds.device).cumsum(0)
-        owners = torch.bucketize(places, ends, right=True)
+        owners = self._owners(places)
         order = owners.sort(stable=True).indices
         sent = torch.bincount(owners, minlength=self.group.size).tolist()
         sent_by = self.group.gather_numbers(sent, str(kinds.device))

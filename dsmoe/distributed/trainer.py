@@ -5,16 +5,16 @@ from typing import Any, Callable, Dict, Optional, Sequence
 
 import torch
 
-from ..config import BATCHED, TrainConfig
-from ..errors import ConfigError, TrainerError
-from ..model import GaussianModel
+from ..config import TrainConfig
+from ..errors import TrainerError
+from ..model import PARAMETERS, GaussianModel
 from ..results.evaluation import Evaluation, rows_of_views, summary
 from ..results.rendering import Rasterize
 from ..scenes.images import View
 from ..scenes.scene import Scene
 from ..system.group import ALONE, Group
 from ..training.trainer import Trainer
-from .batch import Batch
+from .batch import Batch, gaussians_of
 from .passes import BatchPasses
 from .shards import DividedShards
 
@@ -23,8 +23,6 @@ class BatchTrainer(Trainer):
     """A training run whose steps have several views; each process of the group has a part of the Gaussians."""
 
     def __init__(self, config: TrainConfig, scene: Scene, group: Group) -> None:
-        if config.strategy not in BATCHED:
-            raise ConfigError(f"--strategy is {config.strategy}; on several GPUs it must be {' or '.join(BATCHED)}")
         self.group = group
         super().__init__(config, scene)
 
@@ -51,11 +49,11 @@ class BatchTrainer(Trainer):
 
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
-        group, device, views = self.group, self.config.device, self.scene.test
+        group, device, views, shown = self.group, self.config.device, self.scene.test, self.result()
 
         def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:
-            settings = [self.renderer.settings_of(view.camera) for view in some]
-            batch = Batch(group, self.model, settings)
+            settings = [shown.settings_of(view.camera) for view in some]
+            batch = Batch(group, gaussians_of(shown.model), settings)
             return {view: batch.draw(view, settings[view], for_backward=False).color for view in batch.own_views}
 
         def longest(seconds: float) -> float:  # all processes decide alike
@@ -67,8 +65,8 @@ class BatchTrainer(Trainer):
                         for index in range(len(views))])
 
     def whole_model(self) -> Optional[GaussianModel]:
-        """The model with all Gaussians in the first process's host memory; None elsewhere."""
-        raw = {name: self.divided.whole(tensor) for name, tensor in self.model.raw.items()}
+        """What `Trainer.whole_model` gives, in the first process's host memory; None elsewhere."""
+        raw = {name: self.divided.whole(tensor) for name, tensor in self.result().model.raw.items()}
         return GaussianModel(raw, self.model.sh_degree) if self.leads else None
 
     def state_dict(self) -> Dict[str, Any]:
@@ -76,6 +74,8 @@ class BatchTrainer(Trainer):
         state = super().state_dict()
         for name in ("raw", "optimizer", "strategy"):
             state[name] = _map_tensors(state[name], self.divided.whole)
+        state["average"] = {name: self.divided.whole(tensor) if name in PARAMETERS else tensor
+                            for name, tensor in state["average"].items()}
         if state["random"]["cuda"]:
             state["random"]["cuda"] = [torch.cuda.get_rng_state()]  # all processes draw the same numbers
         return state
@@ -85,6 +85,8 @@ class BatchTrainer(Trainer):
         whole = len(state["raw"]["means3D"])
         self.divided.divide(whole)
         own = {name: _map_tensors(state[name], self.divided.own_rows) for name in ("raw", "optimizer", "strategy")}
+        own["average"] = {name: self.divided.own_rows(tensor) if name in PARAMETERS else tensor.to(self.config.device)
+                          for name, tensor in state["average"].items()}
         generators = state["random"]["cuda"]
         super().load_state_dict({**state, **own, "random": {**state["random"], "cuda": []}})
         if generators and torch.cuda.is_available():

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from typing import List, Sequence, Tuple
+from typing import Any, List, Sequence, Tuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ..errors import printable
 
 MARGIN = 6  # pixels between pictures
-LABEL_HEIGHT = 18
+LABEL_SHARE = 25  # a label is this part of a picture's width high
 WINDOW_SHARE = 4  # a window is this part of the picture's width and height, and magnified as much
 MIN_WIDTH = 400  # of each picture; smaller ones are enlarged by a whole factor
 FRAME = (255, 60, 0)
@@ -38,18 +38,28 @@ def comparison(truth: Image.Image, renderings: Sequence[Tuple[str, Image.Image]]
     columns = [("ground truth", truth), *renderings]
     factor = max(1, -(-MIN_WIDTH // truth.width))
     width, height = truth.width * factor, truth.height * factor
+    font_size = width // LABEL_SHARE
+    label_height = font_size * 3 // 2
     sheet = Image.new("RGB", (len(columns) * (width + MARGIN) + MARGIN,
-                              LABEL_HEIGHT + 2 * (height + MARGIN)), (255, 255, 255))
-    draw = ImageDraw.Draw(sheet)
+                              label_height + 2 * (height + MARGIN)), (255, 255, 255))
+    draw, font = ImageDraw.Draw(sheet), _font(font_size)
     for index, (label, image) in enumerate(columns):
         left = MARGIN + index * (width + MARGIN)
-        draw.text((left, 3), label, fill=(0, 0, 0), font=ImageFont.load_default())
+        draw.text((left, font_size // 8), label, fill=(0, 0, 0), font=font)
         whole = image.resize((width, height), Image.NEAREST)
-        ImageDraw.Draw(whole).rectangle([value * factor for value in window], outline=FRAME)
-        sheet.paste(whole, (left, LABEL_HEIGHT))
+        ImageDraw.Draw(whole).rectangle([value * factor for value in window], outline=FRAME, width=1 + width // 400)
+        sheet.paste(whole, (left, label_height))
         part = image.crop(window).resize((width, height), Image.NEAREST)
-        sheet.paste(part, (left, LABEL_HEIGHT + height + MARGIN))
+        sheet.paste(part, (left, label_height + height + MARGIN))
     return sheet
+
+
+def _font(size: int) -> Any:
+    """Pillow's font, so many pixels high; before Pillow 10.1 it has one size, about 11."""
+    try:
+        return ImageFont.load_default(size)
+    except TypeError:
+        return ImageFont.load_default()
 
 
 def loss_plot(losses: Sequence[Tuple[int, float]]) -> Image.Image:

@@ -48,6 +48,10 @@ class Group:
         """The rows of all processes, in their order. counts: how many each has."""
         return rows
 
+    def of_first(self, rows: torch.Tensor) -> torch.Tensor:
+        """The rows of the first process, in all; elsewhere their number may differ."""
+        return rows
+
     def rows_on_first(self, rows: torch.Tensor, counts: Sequence[int]) -> Optional[torch.Tensor]:
         """The rows of all processes in the memory of the first one's host; None elsewhere."""
         return rows
@@ -95,6 +99,13 @@ class DistributedGroup(Group):
         for rank, part in enumerate(parts):
             if len(part) > 0:
                 torch.distributed.broadcast(part, rank)
+        return out
+
+    def of_first(self, rows: torch.Tensor) -> torch.Tensor:
+        (count,) = self.gather_numbers([len(rows)], str(rows.device))[0]
+        out = rows.contiguous() if self.leads else rows.new_empty((count, *rows.shape[1:]))
+        if count > 0:
+            torch.distributed.broadcast(out, 0)
         return out
 
     def rows_on_first(self, rows: torch.Tensor, counts: Sequence[int]) -> Optional[torch.Tensor]:

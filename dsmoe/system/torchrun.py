@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from typing import List, Sequence
@@ -9,20 +10,28 @@ from typing import List, Sequence
 from ..errors import ConfigError
 from .children import die_with_parent
 
-GPUS = "--gpus"
+GPUS, AUTO = "--gpus", "auto"
 
 
-def check_gpus(gpus: int, device: str) -> None:
-    """Raises ConfigError where a training cannot take so many GPUs of this machine."""
+def chosen_gpus(asked: str, device: str, batch: int) -> int:
+    """How many GPUs of this machine a training takes. asked: a number, or `auto`: all, but no more than --batch.
+
+    Raises ConfigError where it cannot take so many.
+    """
     import torch
 
     if device != "cuda":
-        raise ConfigError(f"{GPUS} is {gpus} with --device {device}; it needs --device cuda")
+        raise ConfigError(f"{GPUS} is {asked} with --device {device}; it needs --device cuda")
     there = torch.cuda.device_count()
     if there == 0:
-        raise ConfigError(f"{GPUS} is {gpus}, and torch finds no GPU here; on CPUs start torchrun with --device cpu")
-    if not 1 <= gpus <= there:
-        raise ConfigError(f"{GPUS} is {gpus}; it must be at least 1 and at most {there}: so many GPUs torch finds here")
+        raise ConfigError(f"{GPUS} is {asked}, and torch finds no GPU here; on CPUs start torchrun with --device cpu")
+    if asked == AUTO:
+        return min(there, batch)
+    number = int(asked) if re.fullmatch(r"\d{1,9}", asked, re.ASCII) else 0
+    if not 1 <= number <= there:
+        raise ConfigError(f"{GPUS} is {asked}; it must be {AUTO}, or at least 1 and at most {there}: so many GPUs "
+                          "torch finds here")
+    return number
 
 
 def without_gpus(words: Sequence[str]) -> List[str]:

@@ -9,6 +9,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import gc
+import math
+import sys
+import warnings
 import weakref
 from typing import Any, Callable, Dict, Hashable, Iterator, List, Optional, Sequence, Tuple
 
@@ -16,6 +19,7 @@ import torch
 
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
+from ..errors import out_of_memory
 from ..scenes.images import View
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -97,6 +101,7 @@ class Graphs(NoGraphs):
         self._memory: List[Any] = []  # weak references
         self._captured: Dict[Hashable, Optional[Captured]] = {}  # None: seen once
         self._launched = 0
+        self._too_many: float = math.inf  # Gaussians, with whose graphs the memory did not suffice
 
     def kind(self, settings: GaussianRasterizationSettings, loss_rule: Hashable, view: View,
              background: Optional[torch.Tensor]) -> Hashable:
@@ -121,8 +126,28 @@ class Graphs(NoGraphs):
                 self._captured[kind] = None
                 self._launched += 1
                 return None
-            found = self._captured[kind] = self._new(len(memory[0]), capture)
+            found = self._captured[kind] = self._capture(len(memory[0]), capture)
         return found
+
+    def _capture(self, num_gaussians: int, capture: Callable[[Captured], None]) -> Optional[Captured]:
+        """A new step; None where the memory does not suffice, also when all other graphs are gone."""
+        if num_gaussians >= self._too_many:
+            return None
+        for _ in range(2):
+            try:
+                return self._new(num_gaussians, capture)
+            except Exception as error:
+                if out_of_memory(error) is None:
+                    raise
+            self._free()  # here, as the error holds what the capture had
+        self._too_many = num_gaussians
+        print(f"dsmoe train: at {num_gaussians} Gaussians the GPU has no memory for steps as CUDA graphs; while there "
+              "are not fewer, steps are launched one by one, which may take longer", file=sys.stderr)
+        return None
+
+    def _free(self) -> None:
+        """Lets go of all graphs."""
+        self._captured.clear()
 
     def _is_full(self, captured: Captured) -> bool:
         """Whether a late replay had nearly more tile instances than there is room for."""
@@ -176,6 +201,12 @@ class CudaGraphs(Graphs):
             self._bytes = max(taken, 0) / num_gaussians
         return captured
 
+    def _free(self) -> None:
+        super()._free()
+        self._pool = self._keeper = None
+        self._room = self._bytes = 0.0
+        torch.cuda.empty_cache()  # during a capture torch does not free what it has cached
+
     def _is_full(self, captured: Captured) -> bool:
         direct = captured.drawn.direct
         return direct.recent_instances() > FULL * direct.room
@@ -210,7 +241,8 @@ class CudaGraphs(Graphs):
             try:
                 function()
             except BaseException:  # it says what is wrong; the end of a broken capture would say less
-                with contextlib.suppress(RuntimeError):
+                with contextlib.suppress(RuntimeError), warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # torch's, that the graph is empty
                     graph.capture_end()
                 raise
             graph.capture_end()

@@ -7,19 +7,16 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, Optional, Tuple
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
-
-from diff_smoe_rasterization.images import as_float
-from diff_smoe_rasterization.splats import Splats
 
 from ..errors import ConfigError
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
 from .drawing import draw
-from .strategy import SteadyStrategy, StrategyContext, ViewStep
+from .strategy import Look, SteadyStrategy, Step, StrategyContext, is_due
 
 # Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, sixteen removals are at 8,200 to 13,825,
 # moves are every 500 until 20,000.
@@ -37,7 +34,7 @@ TERMS = 100  # in densify_until_iter, at least, where that has so many steps
 NEEDED_COST = 1e-3
 
 NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
-ROWS_AT_ONCE = 2 ** 16  # whose distances to all cameras are in memory
+NUMBERS_AT_ONCE = 2 ** 22  # coordinates of Gaussians, each seen from every camera: 16 MB of them are in memory
 
 # Growth beyond this many, or beyond twice the budget where that is more, would cost time and memory: no budget above
 # 200,000 was tried with more.
@@ -58,11 +55,11 @@ class ImportanceStrategy(SteadyStrategy):
         self.options = config.importance_options()
         super().__init__(context)
         context.optimizer.scale_rate("shs", self.options.bands)
-        self.start = context.model.num_gaussians
+        self.start = context.num_gaussians
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)
         count = self.options.removals
-        last = config.iterations - 1  # the last iteration changes nothing
+        last = config.iterations - config.batch  # the last step changes nothing
         self.removals = [min(last, round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count)))
                          for i in range(count)]
         interval = max(1, round(MOVE_INTERVAL * until))
@@ -72,24 +69,29 @@ class ImportanceStrategy(SteadyStrategy):
         self.average_begins = round(AVERAGE_BEGINS * until)
         self.between_terms = max(1, min(MOST_BETWEEN_TERMS, until // TERMS))
         self.average_span = self.options.average * until  # steps
+        self._looked: List[View] = []  # by the step in progress
         self._find_free_space()
         self._check_reach()
 
     def _check_reach(self) -> None:
         """Raises ConfigError where growth cannot lead to the budget: a densification doubles at most."""
         config = self.context.config
-        densifications = sum(iteration > config.densify_from_iter for iteration in range(
-            0, self.growth_ends, config.densification_interval))
-        most = self.start * 2**densifications
+        most = self.start * 2**self._densifications(config.densify_from_iter)
         if most < config.budget:
             raise ConfigError(f"--budget is {config.budget}; it must be at most {most}: that is what {self.start} "
                               "points reach with one densification each --densification-interval "
                               f"{config.densification_interval} between --densify-from-iter "
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
 
+    def _densifications(self, behind: int) -> int:
+        """How many densifications come behind an iteration."""
+        config = self.context.config
+        return sum(is_due(iteration, config.densification_interval, config.batch)
+                   for iteration in range(config.batch, self.growth_ends, config.batch) if iteration > behind)
+
     def _find_free_space(self) -> None:
         """Around each training camera is a ball in which nothing can be, as the points of the scene begin behind it."""
-        points = self.context.model.raw["means3D"].detach()
+        points = self.context.shards.every(self.context.model.raw["means3D"].detach())
         nearest = max(1, int(NEAREST_POINTS * len(points)))
         centers = np.stack([view.camera.center for view in self.context.views])
         self.cameras = torch.tensor(centers, dtype=points.dtype, device=points.device)  # [views, 3]
@@ -101,7 +103,7 @@ class ImportanceStrategy(SteadyStrategy):
 
         They are haze that changes the training views a little, and covers a test view whose camera is closer to them.
         """
-        parts = self.context.model.raw["means3D"].detach().split(ROWS_AT_ONCE)
+        parts = self.context.model.raw["means3D"].detach().split(max(1, NUMBERS_AT_ONCE // self.cameras.numel()))
         return torch.cat([((part[:, None] - self.cameras).square().sum(2) < self.free_radii.square()).any(1)
                           for part in parts])
 
@@ -118,19 +120,19 @@ class ImportanceStrategy(SteadyStrategy):
             share = min(max((iteration - self.moves_end) / span, 0.0), 1.0)
             self.context.optimizer.scale_other_rates(self.options.anneal**share)
 
-    def before_backward(self, step: ViewStep) -> None:
-        if self._looks(step):
-            self._look(step.view, step.target, step.rendering.color, step.splats())
+    def before_backward(self, step: Step) -> None:
+        for view, look in zip(self._looked, step.looks):
+            self._add(view, look)
 
-    def after_step(self, step: ViewStep) -> None:
-        if step.iteration in self.removals:
+    def after_step(self, step: Step) -> None:
+        if any(map(step.reaches, self.removals)):
             self.remove(1 + sum(later > step.iteration for later in self.removals))
-        elif step.iteration in self.moves:
+        elif any(map(step.reaches, self.moves)):
             self.move()
-        behind = step.iteration - self.average_begins
-        if self.average_span > 0 and behind > 0 and behind % self.between_terms == 0:
+        behind, between = step.iteration - self.average_begins, self.between_terms
+        if self.average_span > 0 and behind // between > max(0, behind - step.batch) // between:
             # At first all terms weigh the same, as else the first one would weigh more than others to the end.
-            part = min(1.0, self.between_terms / min(self.average_span, behind))
+            part = min(1.0, max(between, step.batch) / min(self.average_span, behind))
             gate = self.context.render.background_gate
             self.context.optimizer.add_to_average(part, gate if isinstance(gate, torch.Tensor) else None)
 
@@ -145,8 +147,8 @@ class ImportanceStrategy(SteadyStrategy):
 
     def growth(self, iteration: int) -> Tuple[int, Optional[int]]:
         """At least what reaches the budget and at most what reaches the overshoot, in equal steps."""
-        config, now = self.context.config, self.context.model.num_gaussians
-        steps = -(-(self.growth_ends - iteration) // config.densification_interval)
+        config, now = self.context.config, self.context.num_gaussians
+        steps = 1 + self._densifications(iteration)
         least = -(-max(0, config.budget - now) // steps)
         if self.options.overshoot == 0:
             return least, None
@@ -163,16 +165,19 @@ class ImportanceStrategy(SteadyStrategy):
 
         First go those that float in front of a camera, then those that few views need.
         """
-        model, budget = self.context.model, self.context.config.budget
-        if model.num_gaussians <= budget:
+        now, budget, shards = self.context.num_gaussians, self.context.config.budget, self.context.shards
+        if now <= budget:
             return
-        ratio = model.num_gaussians / budget
+        ratio = now / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
         self._look_at_the_rest()
         scores = torch.where(self.is_of_few(), -1 / self.costs, self.costs).masked_fill(self.is_near(), -math.inf)
-        mask = torch.zeros_like(self.costs, dtype=torch.bool)
-        mask[torch.topk(scores, kept).indices] = True
-        self.context.optimizer.keep(mask)
+        best = shards.decide(lambda every: torch.topk(every, kept).indices, scores)
+        mask = torch.zeros(now, dtype=torch.bool, device=scores.device)
+        mask[best] = True
+        own = shards.own_rows(mask)
+        self.context.optimizer.keep(own)
+        shards.settle(torch.zeros_like(own, dtype=torch.long)[own])
         self._forget_statistics()
 
     def move(self) -> None:
@@ -182,66 +187,78 @@ class ImportanceStrategy(SteadyStrategy):
         the latter.
         """
         self._look_at_the_rest()
-        count = int(self.options.moves * len(self.costs))
         near = self.is_near()
-        costs, sources = torch.topk(self.costs.masked_fill(near | self.is_of_few(), 0), count, largest=False)
-        errors = self.errors.masked_fill(near, 0)
+        costs, errors = self.costs.masked_fill(near | self.is_of_few(), 0), self.errors.masked_fill(near, 0)
         self._forget_looks()
-        errors[sources] = 0
+        moves = self.context.shards.decide(self._choose_moves, costs, errors)
+        self.split(*moves.unbind(1))
+
+    def _choose_moves(self, costs: torch.Tensor, errors: torch.Tensor) -> torch.Tensor:
+        """[M, 2] rows of Gaussians to split, and of those that move there. costs, errors: [N] of all Gaussians."""
+        count = int(self.options.moves * len(costs))
+        costs, sources = torch.topk(costs, count, largest=False)
+        errors = errors.index_fill(0, sources, 0)
         count = min(count, int((errors > 0).sum()))
         if count == 0:
-            return
+            return sources.new_empty((0, 2))
         targets = draw(errors, count)
         errors, order = errors[targets].sort(descending=True)
         worth = (costs[:count] < self.options.worth * errors).nonzero().squeeze(1)
-        self.split(targets[order][worth], sources[worth])
+        return torch.stack([targets[order][worth], sources[worth]], 1)
 
     def split(self, parents: torch.Tensor, places: torch.Tensor) -> None:
-        """Splits Gaussians in two along their longest axis. parents: rows; places: rows that the second children take.
+        """Splits Gaussians in two along their longest axis. places: of those whose places the second children take.
 
-        The children begin without Adam's first moment, and with their parent's second one.
+        Both are rows among all Gaussians. The children begin without Adam's first moment, and with their parent's
+        second one.
         """
+        parents, places, send = self.context.shards.route(parents, places)
         raw = {name: self.context.model.raw[name].detach().index_select(0, parents) for name in PARAMETERS}
         scales = raw["scales"].exp()
         axis = scales.argmax(dim=1, keepdim=True)
         directions = rotation_matrices(raw["rotations"]).gather(2, axis.unsqueeze(1).expand(-1, 3, 1)).squeeze(2)
         offsets = CHILD_OFFSET * scales.gather(1, axis) * directions
-        opacities = raw["opacities"].sigmoid()
+        opacities = self.context.model.opacities.detach().index_select(0, parents)
         children = torch.minimum(opacities, (1 - (1 - opacities).sqrt()) / CHILD_COVER)
         raw["opacities"] = inverse_sigmoid(children.clamp(max=1 - 1e-6))  # of 1 it is infinite
         raw["scales"] = torch.where(torch.arange(3, device=axis.device) == axis, (CHILD_SCALE * scales).log(),
                                     raw["scales"])
         means = raw["means3D"]
-        for rows, place in ((parents, means + offsets), (places, means - offsets)):
-            self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
+        second = {name: send(rows) for name, rows in {**raw, "means3D": means - offsets}.items()}
+        overwrite = self.context.optimizer.overwrite
+        overwrite(parents, {**raw, "means3D": means + offsets}, lambda squares: squares.index_select(0, parents))
+        overwrite(places, second, lambda squares: send(squares.index_select(0, parents)))
 
-    def _looks(self, step: ViewStep) -> bool:
-        """Whether the next decision looks at this step's view: one of each group, in the last round of the views."""
-        if step.view.camera.name not in self.sought:
-            return False
-        removes = self.context.model.num_gaussians > self.context.config.budget
-        following = next((later for later in [*self.removals, *self.moves] if later >= step.iteration), None)
-        return (following is not None and following - step.iteration < len(self.context.views)
-                and (removes or following > self.removals[-1]))
+    def looks_at(self, iteration: int, views: Sequence[View]) -> List[int]:
+        """Those that the next decision wants: the first of each group, in the last round of the views."""
+        removes = self.context.num_gaussians > self.context.config.budget
+        begun = iteration - self.context.config.batch
+        following = next((later for later in [*self.removals, *self.moves] if later > begun), None)
+        wanted: List[int] = []
+        if (following is not None and following - iteration < len(self.context.views)
+                and (removes or following > self.removals[-1])):
+            wanted = self._firsts(views)
+        self._looked = [views[index] for index in wanted]
+        return wanted
 
-    def _look(self, view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> None:
+    def _firsts(self, views: Sequence[View]) -> List[int]:
+        """Which of the views are the first of a group that is sought."""
+        groups = [self.sought.get(view.camera.name) for view in views]
+        return [index for index, group in enumerate(groups) if group is not None and group not in groups[:index]]
+
+    def _add(self, view: View, look: Look) -> None:
         """Adds what each Gaussian is worth to one rendering."""
-        error = (color.detach() - as_float(target)).square().sum(0)
-        mask = view.mask_float()
-        weights = None if mask is None else mask[0]
-        importance = splats.importance(weights, error if weights is None else weights * error)
-        self.costs += importance.removal_costs
-        self.needed += importance.removal_costs > NEEDED_COST
-        self.errors += importance.shares
+        self.costs += look.costs
+        self.needed += look.costs > NEEDED_COST
+        self.errors += look.errors
         group = self.sought.get(view.camera.name)
         self.sought = {name: other for name, other in self.sought.items() if other != group}
 
     def _look_at_the_rest(self) -> None:
         """Renders what the steps before the decision did not show."""
-        for view in self.context.views:
-            if view.camera.name in self.sought:
-                rendering, splats = self.context.render.with_splats(view.camera)
-                self._look(view, view.image, rendering.color, splats)
+        views = [self.context.views[index] for index in self._firsts(self.context.views)]
+        for view, look in zip(views, self.context.look(views)):
+            self._add(view, look)
 
     def _forget_statistics(self) -> None:
         super()._forget_statistics()

@@ -13,7 +13,7 @@ from diff_smoe_rasterization.gaussians import divided
 
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from .drawing import draw
-from .strategy import Strategy, StrategyContext, ViewStep
+from .strategy import Step, Strategy, StrategyContext
 
 DEAD_OPACITY = 0.005  # fainter Gaussians are relocated
 START_OPACITY, START_SCALE = 0.5, 0.1  # of the first Gaussians; the scale is a part of that of 3DGS
@@ -33,37 +33,46 @@ class MCMCStrategy(Strategy):
             context.model.raw["opacities"].fill_(float(inverse_sigmoid(torch.tensor(START_OPACITY))))
             context.model.raw["scales"] += float(torch.tensor(START_SCALE).log())
 
-    def after_backward(self, step: ViewStep) -> None:
-        """Adds the gradients of the two regularisers, which are means over the Gaussians."""
+    def after_backward(self, step: Step) -> None:
+        """Adds the gradients of the two regularisers, which are means over the Gaussians, for each view of the step."""
         for name, weight in (("opacities", OPACITY_WEIGHT), ("scales", SCALE_WEIGHT)):
-            step.add_gradient(name, weight / self.context.model.stored[name].numel())
+            numbers = self.context.num_gaussians * self.context.model.stored[name].shape[1]
+            step.add_gradient(name, step.batch * weight / numbers)
 
-    def after_step(self, step: ViewStep) -> None:
+    def after_step(self, step: Step) -> None:
         config = self.context.config
         if (config.densify_from_iter < step.iteration < round(GROWTH_ENDS * config.densify_until_iter)
-                and step.iteration % config.densification_interval == 0):
+                and step.due(config.densification_interval)):
             self.relocate()
             self.grow()
         self.shake()
 
     def relocate(self) -> None:
         """Moves dead Gaussians to living ones, drawn by opacity."""
-        opacities = self.context.model.opacities.squeeze(1)
+        shards = self.context.shards
+        drawn, dead = shards.decide(self._choose_relocations, self.context.model.opacities.squeeze(1)).unbind(1)
+        origins, places, send = shards.route(drawn, dead)
+        joining = self._divide(origins)
+        self.context.optimizer.overwrite(places, {name: send(rows) for name, rows in joining.items()})
+
+    def _choose_relocations(self, opacities: torch.Tensor) -> torch.Tensor:
+        """[M, 2] rows of living Gaussians, and of the dead ones that join them. opacities: [N] of all Gaussians."""
         alive, dead = (opacities > DEAD_OPACITY).nonzero().squeeze(1), (opacities <= DEAD_OPACITY).nonzero().squeeze(1)
         if len(alive) == 0 or len(dead) == 0:
-            return
-        drawn = alive[draw(opacities[alive], len(dead), replacement=True)]
-        self.context.optimizer.overwrite(dead, self._divide(drawn))
+            return dead.new_empty((0, 2))
+        return torch.stack([alive[draw(opacities[alive], len(dead), replacement=True)], dead], 1)
 
     def grow(self) -> None:
         """Adds Gaussians, at least one, at others, drawn by opacity, up to the budget."""
-        model, budget = self.context.model, self.context.config.budget
-        now = model.num_gaussians
-        count = min(budget, max(now + 1, int((1 + GROWTH) * now))) - now
+        model, shards, now = self.context.model, self.context.shards, self.context.num_gaussians
+        count = min(self.context.config.budget, max(now + 1, int((1 + GROWTH) * now))) - now
         if count <= 0:
             return
-        drawn = draw(model.opacities.squeeze(1), count, replacement=True)
-        self.context.optimizer.append(self._divide(drawn))
+        drawn = shards.decide(lambda every: draw(every, count, replacement=True).sort().values,
+                              model.opacities.squeeze(1))
+        own, before = shards.route(drawn, drawn).origins, model.num_gaussians
+        self.context.optimizer.append(self._divide(own))
+        shards.settle((torch.arange(model.num_gaussians, device=own.device) >= before).long())
 
     def _divide(self, drawn: torch.Tensor) -> Dict[str, torch.Tensor]:
         """Makes room at the drawn rows [M], of which some may be equal. Returns the M raw Gaussians that join them."""
@@ -82,6 +91,9 @@ class MCMCStrategy(Strategy):
         opacities, scales, rotations = self.context.model.activated()
         means = self.context.model.stored["means3D"]
         axes = rotation_matrices(rotations) * scales.unsqueeze(1)
-        faint = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - opacities))
-        noise = faint * (NOISE_RATE * self.context.optimizer.position_rate) * torch.randn_like(means)
-        means += torch.bmm(axes, torch.bmm(axes.transpose(1, 2), noise.unsqueeze(2))).squeeze(2)
+        # Neither torch.sigmoid nor torch.bmm: they may round otherwise for another number of rows.
+        faint = 1 / (1 + torch.exp(NOISE_STEEPNESS * (opacities - DEAD_OPACITY)))
+        normal = self.context.shards.own_rows(torch.randn(self.context.num_gaussians, 3, device=means.device))
+        noise = faint * (NOISE_RATE * self.context.optimizer.position_rate) * normal
+        along = (axes * noise.unsqueeze(2)).sum(1)
+        means += (axes * along.unsqueeze(1)).sum(2)

@@ -2,12 +2,13 @@
 
 `AutogradPasses` takes any rasterizer. `DirectPasses` is for a GPU, where a step is bound by memory traffic and by
 Python: it steps spherical harmonics lazily, makes one pass of activations and Adam, writes no gradient of what was not
-seen, and repeats steps as CUDA graphs. `BatchPasses`, in distributed/passes.py, take several views and processes.
+seen, and repeats steps as CUDA graphs. `BatchPasses`, in distributed/passes.py, do the same without graphs, for several
+views and processes.
 """
 from __future__ import annotations
 
 import weakref
-from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Set, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 import torch
 
@@ -26,7 +27,7 @@ from ..scenes.cameras import Camera
 from ..scenes.images import View
 from .background_gate import LearnedGate
 from .graphs import Captured, Graphs, NoGraphs
-from .strategy import Step, ViewStep
+from .strategy import Look, Step, ViewStep, look_at
 
 _OPS = torch.ops.diff_smoe_rasterization
 ACTIVATED = ("opacities", "scales", "rotations")
@@ -52,8 +53,8 @@ class Passes:
         """gate: the background's, where it is learned."""
         self.model, self.optimizer, self.renderer, self.gate = model, optimizer, renderer, gate
 
-    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> Step:
-        """Renders the views of the step that ends with this iteration, and compares them."""
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()) -> Step:
+        """Renders the views of the step that ends with this iteration, compares them, and looks at some of them."""
         raise NotImplementedError
 
     def backward(self, step: Step) -> None:
@@ -64,29 +65,42 @@ class Passes:
         """Steps the parameters that have not been replaced since `render`."""
         raise NotImplementedError
 
+    def look(self, views: Sequence[View]) -> Iterator[Look]:
+        """Renders views beside the steps, and looks at each."""
+        for view in views:
+            rendering, splats = self.renderer.with_splats(view.camera)
+            yield look_at(view, view.image, rendering.color, splats)
+
+    @torch.enable_grad()
+    def _add_gradient(self, name: str, number: float) -> None:
+        """Adds a number to the gradient by every opacity, scale or rotation (the parameter's name); after backward."""
+        value = self.model.activated()[ACTIVATED.index(name)]
+        value.backward(torch.full_like(value, number))
+
 
 class AutogradPasses(Passes):
     """The passes as torch knows them."""
 
-    _seen: Optional[Callable[[], Splats]] = None
-
-    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> ViewStep:
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()
+               ) -> ViewStep:
         (shown,) = views
-        rendering, self._means2D = self._draw(shown.view.camera, shown.background)
+        rendering, self._means2D, splats = self._draw(shown.view.camera, shown.background)
         target, loss, self._dL_dcolor = compare(shown, rendering.color.detach())
-        return ViewStep(iteration, 1, loss, shown.view, target, rendering, self._splats, self._add_gradient)
+        step = ViewStep(iteration, 1, loss, self._add_gradient, shown.view, target, rendering)
+        step.looks += [look_at(shown.view, target, rendering.color, splats()) for _ in looked]
+        return step
 
     def backward(self, step: Step) -> None:
         assert isinstance(step, ViewStep)
-        self._seen = None  # which holds on to memory, as what is deleted below
         self._color.backward(self._dL_dcolor)
         gradient = self._means2D.grad
         assert gradient is not None
         step.seen.append((gradient, step.rendering.radii))
-        del self._means2D, self._dL_dcolor, self._color
+        del self._means2D, self._dL_dcolor, self._color  # which hold on to memory
 
-    def _draw(self, camera: Camera, background: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
-        """The image, and a tensor [N, 3] whose .grad `backward` sets where radii > 0.
+    def _draw(self, camera: Camera, background: Optional[torch.Tensor]
+              ) -> Tuple[Rendering, torch.Tensor, Callable[[], Splats]]:
+        """The image, a tensor [N, 3] whose .grad `backward` sets where radii > 0, and what the image says of each.
 
         background: in place of the renderer's.
         """
@@ -98,23 +112,11 @@ class AutogradPasses(Passes):
         view = (camera, background, gate)
         if self.renderer.rasterize is package_rasterizer():
             rendering, splats = self.renderer.with_splats(*view, means2D=means2D)
-            self._seen = lambda: splats
-        else:
-            rendering = self.renderer(*view, means2D=means2D)
-            self._seen = lambda: self.renderer.with_splats(*view)[1]
+            self._color = rendering.color
+            return rendering, means2D, lambda: splats
+        rendering = self.renderer(*view, means2D=means2D)
         self._color = rendering.color
-        return rendering, means2D
-
-    def _splats(self) -> Splats:
-        """What the image of `_draw` says of each Gaussian."""
-        assert self._seen is not None, "render comes first"
-        return self._seen()
-
-    @torch.enable_grad()
-    def _add_gradient(self, name: str, number: float) -> None:
-        """Adds a number to the gradient by every opacity, scale or rotation (the parameter's name); after backward."""
-        value = self.model.activated()[ACTIVATED.index(name)]
-        value.backward(torch.full_like(value, number))
+        return rendering, means2D, lambda: self.renderer.with_splats(*view)[1]
 
     def update(self) -> None:
         self.optimizer.step()
@@ -146,44 +148,42 @@ class DirectPasses(Passes):
         self._values: List[torch.Tensor] = []  # what `activate` makes of the parameters
         self._made_of: List[Tuple[torch.Tensor, int]] = []  # these, and their versions at that time
         self._buffers: Dict[str, torch.Tensor] = {}  # gradients
+        self._captured: Optional[Captured] = None  # the step in progress, where it is
         # How many steps harmonics may have missed, then the rates of geometry and of harmonics, as the ops take them.
         self._numbers = model.stored["means3D"].new_zeros(1 + 2 * len(PARAMETERS))
 
     @torch.no_grad()
-    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> ViewStep:
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()
+               ) -> ViewStep:
         (shown,) = views
-        stored, lazy = self.model.stored, self.optimizer.lazy_colors()
-        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
-        self._rendered = {name: weakref.ref(tensor) for name, tensor in stored.items()}
-        self._activate()
-        steps = lazy.begin_catch_up()
+        lazy = self._begin()
         settings = self.renderer.settings_of(shown.view.camera, shown.background)
         kind = self._graphs.kind(settings, self._loss_rule(iteration), *shown)
-        self._captured: Optional[Captured] = None  # of the step before: it may hold on to memory
+        self._captured = None  # of the step before: it may hold on to memory
         self._captured = self._graphs.find(
-            [*stored.values(), lazy], kind, lambda captured: self._capture(captured, settings, shown, compare))
-        self._sent = [float(steps), *self._rates(1), *lazy.next_rates()]
-        numbers = self._numbers[:len(self._sent)]
+            [*self.model.stored.values(), lazy], kind,
+            lambda captured: self._capture(captured, settings, shown, compare))
         if self._captured:
+            numbers = self._numbers[:len(self._sent)]
             self._drawn: _Drawn = self._captured.replay_draw(numbers, self._sent, settings, *shown)
         else:
-            _OPS.set_inputs([], [], numbers, self._sent)
+            self._send_numbers(self._sent)
             self._drawn = self._draw(settings, shown, compare)
         lazy.end()
         drawn = self._drawn
         self._radii = self._stepped = drawn.rendering.radii
-        return ViewStep(iteration, 1, drawn.loss, shown.view, drawn.target, drawn.rendering, drawn.direct.splats,
-                        self._add_gradient)
+        step = ViewStep(iteration, 1, drawn.loss, self._add_gradient, shown.view, drawn.target, drawn.rendering)
+        step.looks += [look_at(shown.view, drawn.target, drawn.rendering.color, drawn.direct.splats()) for _ in looked]
+        return step
 
     @torch.no_grad()
     def backward(self, step: Step) -> None:
-        stored = self.model.stored
-        self._gradients = {name: self._buffer("d" + name, stored[name]) for name in GEOMETRY}
+        self._buffers_of_gradients()
         if self._captured:
             self._captured.replay_differentiate()
         else:
             self._differentiate(self._drawn)
-        step.seen.append((self._buffer("dmeans2D", stored["means3D"]), self._radii))
+        step.seen.append((self._buffer("dmeans2D", self.model.stored["means3D"]), self._radii))
         del self._drawn  # which holds on to memory
 
     @torch.no_grad()
@@ -201,7 +201,7 @@ class DirectPasses(Passes):
         if colors and lazy is not None:
             numbers[0], numbers[1 + 2 * len(GEOMETRY):] = lazy.begin_step()
         if numbers != self._sent:  # a hook has changed learning rates, or read the model
-            _OPS.set_inputs([], [], self._numbers[:len(numbers)], numbers)
+            self._send_numbers(numbers)
         if self._captured and geometry and colors and self._stepped is self._radii:
             self._captured.replay_update()
         else:
@@ -211,6 +211,32 @@ class DirectPasses(Passes):
                 self._step_colors(lazy, self._radii)
         if colors and lazy is not None:
             lazy.end()
+
+    def _begin(self) -> LazyAdam:
+        """The host's part of a step's beginning: `_sent` is what `_numbers` are to be."""
+        lazy = self.optimizer.lazy_colors()
+        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
+        self._rendered = {name: weakref.ref(tensor) for name, tensor in self.model.stored.items()}
+        self._activate()
+        steps = lazy.begin_catch_up()
+        self._sent = [float(steps), *self._rates(1), *lazy.next_rates()]
+        return lazy
+
+    def _send_numbers(self, numbers: List[float]) -> None:
+        _OPS.set_inputs([], [], self._numbers[:len(numbers)], numbers)
+
+    def _gaussians(self) -> Dict[str, torch.Tensor]:
+        """The arguments of a rendering that have a row for each Gaussian."""
+        stored = self.model.stored
+        colors = {argument: stored[name] for argument, name in self.model.color_sources().items()}
+        return {"means3D": stored["means3D"], **dict(zip(ACTIVATED, self._values)), **colors}
+
+    def _buffers_of_gradients(self) -> Dict[str, torch.Tensor]:
+        """Where the gradients by `_gaussians` go."""
+        lazy = self.model.lazy
+        assert lazy is not None
+        self._gradients = {name: self._buffer("d" + name, self.model.stored[name]) for name in GEOMETRY}
+        return {**self._gradients, **dict(zip(self.model.color_sources(), lazy.gradients))}
 
     def _capture(self, captured: Captured, settings: GaussianRasterizationSettings, shown: ViewOver,
                  compare: Compare) -> None:
@@ -227,23 +253,17 @@ class DirectPasses(Passes):
         captured.capture(lambda: self._draw(settings, ViewOver(view, background), compare), self._differentiate, update)
 
     def _draw(self, settings: GaussianRasterizationSettings, shown: ViewOver, compare: Compare) -> _Drawn:
-        parameters, lazy = self.model.stored, self.model.lazy
+        lazy = self.model.lazy
         assert lazy is not None
-        colors = {argument: parameters[name] for argument, name in self.model.color_sources().items()}
-        direct = DirectRendering(
-            parameters["means3D"], self._values[0], settings, means2D=self._buffer("means2D", parameters["means3D"]),
-            scales=self._values[1], rotations=self._values[2], **colors)
+        gaussians = self._gaussians()
+        direct = DirectRendering(settings=settings, means2D=self._buffer("means2D", gaussians["means3D"]), **gaussians)
         lazy.launch_catch_up(direct.visible_radii(), self._numbers[:1])
         rendering = direct.render()
         return _Drawn(direct, rendering, *compare(shown, rendering.color))
 
     def _differentiate(self, drawn: _Drawn) -> None:
         """From the gradient by the image to those by all parameters and the gate."""
-        stored, lazy = self.model.stored, self.model.lazy
-        assert lazy is not None
-        gradients = {name: self._buffer("d" + name, stored[name]) for name in GEOMETRY}
-        gradients.update(zip(self.model.color_sources(), lazy.gradients))
-        gradients["means2D"] = self._buffer("dmeans2D", stored["means3D"])
+        gradients = {**self._buffers_of_gradients(), "means2D": self._buffer("dmeans2D", self.model.stored["means3D"])}
         if self.gate:
             gradients["background_gate"] = self.gate.gradient
         drawn.direct.backward({"color": drawn.dL_dcolor}, gradients)

@@ -1,9 +1,17 @@
 """Which of the Gaussians a process has, and what it must ask of the others. Alone, it has all."""
 from __future__ import annotations
 
-from typing import Callable
+from typing import Callable, NamedTuple
 
 import torch
+
+
+class Route(NamedTuple):
+    """Pairs of a Gaussian and a place, which takes something of it: what a process has of them."""
+
+    origins: torch.Tensor  # own rows from which something goes, as often as it does
+    places: torch.Tensor  # own rows to which something comes
+    send: Callable[[torch.Tensor], torch.Tensor]  # from a row for each of `origins` to one for each of `places`
 
 
 class Shards:
@@ -13,12 +21,28 @@ class Shards:
     """
 
     def total(self, count: int) -> int:
-        """How many things all processes have together."""
+        """How many Gaussians all processes have together, where this one has `count` and they are settled."""
         return count
 
-    def over_all(self, function: Callable[[torch.Tensor], torch.Tensor], values: torch.Tensor) -> torch.Tensor:
-        """This process's rows of function(values of all processes), which keeps their number. values: [N, ...]."""
-        return function(values)
+    def every(self, rows: torch.Tensor) -> torch.Tensor:
+        """The rows of all Gaussians. rows: [N, ...] those of this process's."""
+        return rows
+
+    def own_rows(self, rows: torch.Tensor) -> torch.Tensor:
+        """This process's rows of those of all Gaussians."""
+        return rows
+
+    def decide(self, function: Callable[..., torch.Tensor], *values: torch.Tensor) -> torch.Tensor:
+        """function(values of all Gaussians), the same in all processes. values: [N, ...] of this process's Gaussians.
+
+        The function may draw random numbers, as many in every process.
+        """
+        return function(*values)
+
+    def route(self, origins: torch.Tensor, places: torch.Tensor) -> Route:
+        """What this process has of pairs of an origin and a place. Both: [M] rows among all Gaussians; places differ.
+        """
+        return Route(origins, places, lambda rows: rows)
 
     def draw(self, function: Callable[[int], torch.Tensor], count: int) -> torch.Tensor:
         """This process's part of what function(total) draws for all things: [K, total, ...] -> [K, count, ...]."""

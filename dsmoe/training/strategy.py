@@ -6,11 +6,12 @@ renderings of training views included, is in StrategyContext.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
 from diff_smoe_rasterization.gaussians import add_view
+from diff_smoe_rasterization.images import as_float
 from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient, l2_ssim_loss_and_gradient
 from diff_smoe_rasterization.settings import Rendering
 from diff_smoe_rasterization.splats import Splats
@@ -29,6 +30,22 @@ CHILDREN = 2  # a split makes so many
 SPLIT_SHRINK = 0.8 * CHILDREN  # a child's scale is its parent's divided by this
 
 
+class Look(NamedTuple):
+    """What one view says of each Gaussian's worth: sums over its pixels of squared colours."""
+
+    costs: torch.Tensor  # [N] how much the image changes on the removal of the Gaussian
+    errors: torch.Tensor  # [N] the error of the image where the Gaussian is, by its share
+
+
+def look_at(view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> Look:
+    """The look at a rendering of the view. target, color: [3, H, W]."""
+    error = (color.detach() - as_float(target)).square().sum(0)
+    mask = view.mask_float()
+    weights = None if mask is None else mask[0]
+    importance = splats.importance(weights, error if weights is None else weights * error)
+    return Look(importance.removal_costs, importance.shares)
+
+
 @dataclass
 class StrategyContext:
     """What a strategy works on, for the whole run."""
@@ -39,6 +56,7 @@ class StrategyContext:
     extent: float  # scene extent, world units
     views: Sequence[View]  # for training
     render: Renderer  # for passes of the strategy's own
+    look: Callable[[Sequence[View]], Iterator[Look]]  # renders views, and looks at each; rows are those of the model
     shards: Shards = field(default_factory=Shards)  # which of the Gaussians the model has
 
     @property
@@ -63,6 +81,8 @@ class Step:
     iteration: int  # of its last view
     batch: int  # views, each an iteration
     loss: torch.Tensor  # the mean over the views
+    add_gradient: Callable[[str, float], None]  # to that by every opacity, scale or rotation; after backward
+    looks: List[Look] = field(default_factory=list, init=False)  # at the views that the strategy's `looks_at` has named
     seen: List[Seen] = field(default_factory=list, init=False)  # what each view says of the Gaussians; after backward
 
     def due(self, interval: int) -> bool:
@@ -81,16 +101,15 @@ class ViewStep(Step):
     view: View
     target: torch.Tensor  # [3, H, W] what the rendering is compared with, uint8 or in 0 to 1
     rendering: Rendering
-    splats: Callable[[], Splats]  # of the rendering; before backward
-    add_gradient: Callable[[str, float], None]  # to that by every opacity, scale or rotation; after backward
 
 
 class Strategy:
     """Does nothing: a fixed set of Gaussians. The base of every strategy.
 
     Hooks run in this order in each step. Learning rates may be set in any, best in the first; rows may be added or
-    removed in the last two (through the optimizer), which the last iteration of a run leaves out. A strategy that is
-    not among config.BATCHED gets each step as a ViewStep. The tensors of a step hold until the next one.
+    removed in the last two (through the optimizer), which the last step of a run leaves out. The tensors of a step hold
+    until the next one. What is decided over all Gaussians is decided through `context.shards`, as a process may have
+    only some of them.
     """
 
     def __init__(self, context: StrategyContext) -> None:
@@ -117,6 +136,10 @@ class Strategy:
 
     def before_render(self, iteration: int) -> None:
         """A step begins that ends with this iteration."""
+
+    def looks_at(self, iteration: int, views: Sequence[View]) -> List[int]:
+        """At which of the views of the step that ends with this iteration `step.looks` is to look, rising."""
+        return []
 
     def before_backward(self, step: Step) -> None:
         """The loss is known, its gradients are not."""
@@ -183,7 +206,8 @@ class ThreeDGSStrategy(Strategy):
         config, model = self.context.config, self.context.model
         wanted = gradients >= config.densify_grad_threshold
         if least > 0 or most is not None:
-            wanted = self.context.shards.over_all(lambda every: self._largest(every, least, most), gradients)
+            shards = self.context.shards
+            wanted = shards.own_rows(shards.decide(lambda every: self._largest(every, least, most), gradients))
         large = model.scales.detach().max(dim=1).values > config.percent_dense * self.context.extent
         parents = wanted & large
         kept, clones = (~parents).nonzero().squeeze(1), (wanted & ~large).nonzero().squeeze(1)

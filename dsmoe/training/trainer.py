@@ -50,7 +50,8 @@ class Trainer:
             background_gate=self.gate.value if self.gate else float(config.background_gate),
             deterministic=config.deterministic)
         self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
-            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer, self.shards))
+            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
+            lambda views: self.passes.look(views), self.shards))
         self.order = ViewOrder(len(scene.train), config.seed)
         self.watch = Stopwatch(config.device)
         self.iteration = 0
@@ -124,7 +125,9 @@ class Trainer:
         if is_due(self.iteration, config.sh_degree_interval, config.batch):
             self.model.raise_sh_degree()
         self.strategy.before_render(self.iteration)
-        step = self.passes.render(self.iteration, self._next_views(), self._compare)
+        views = self._next_views()
+        looked = self.strategy.looks_at(self.iteration, [shown.view for shown in views])
+        step = self.passes.render(self.iteration, views, self._compare, looked)
         if isinstance(step, ViewStep):  # a repeated step does not call `_compare`
             self._report = (step.rendering.color.detach(), step.target, step.view)
         self.strategy.before_backward(step)

@@ -11,12 +11,14 @@ from devices import without_cuda_because
 
 from diff_smoe_rasterization.settings import BLEND_MODES
 
-sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks", "timing"))
+BENCHMARKS = os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks")
+sys.path[:0] = [BENCHMARKS, os.path.join(BENCHMARKS, "timing")]
 import cpu_rasterizer  # noqa: E402
 import gpu_floor  # noqa: E402
 import gpu_rasterizer  # noqa: E402
 import memory  # noqa: E402
 import models  # noqa: E402
+import tables  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -142,3 +144,41 @@ def test_the_gpu_command_measures(tmp_path, capsys):
     twin = rows["ours alpha deterministic"]
     assert twin["psnr_worst"] > 80 and twin["cosine"] > 0.9999
     assert "times the floor" in capsys.readouterr().out
+
+
+def test_the_tables_of_the_pages_are_those_of_the_rows():
+    rows = tables.trainings()
+    for page, text in (("../README.md", tables.readme_table(rows)), ("RESULTS.md", tables.budget_table(rows)),
+                       ("RESULTS.md", tables.recipe_table(rows)), ("RESULTS.md", tables.race_table()),
+                       ("NOTES.md", tables.rules_table())):
+        with open(os.path.join(BENCHMARKS, page), encoding="utf-8") as file:
+            assert text in file.read(), f"{page}: `python benchmarks/tables.py` prints another table:\n{text}"
+
+
+def test_a_table_has_the_mean_and_the_deviation_of_its_rows():
+    rows = [dict(scene="fox", strategy="importance", budget=4000, densify_grad_threshold=0.0002, blend_mode=blend,
+                 seed=seed, psnr=psnr, ssim=ssim, lpips={"value": ssim / 2})
+            for blend, seed, psnr, ssim in (("alpha", 0, 30.0, 0.5), ("smoe", 1, 31.5, 0.75), ("alpha", 1, 32.0, 0.7),
+                                            ("smoe", 0, 30.5, 0.85))]
+    assert tables.budget_table(rows).splitlines()[2] == (
+        "| fox, 4,000 | 31.00 ± 1.41 | 0.600 | 0.300 | 31.00 ± 0.71 | 0.800 | 0.400 | +0.50, -0.50 |")
+    assert tables.thousands([{"num_gaussians": 1_198_600}]) == "1,199k"
+    assert tables.thousands([{"num_gaussians": 99_940}]) == "99.9k"
+
+
+def test_rows_are_read_as_the_report_reads_them():
+    pytest.importorskip("pydantic")
+    from dsmoe.bench.rows import read_rows
+
+    read = {row["cell"]: row for row in read_rows(str(tables.RESULTS / "near_h100.jsonl"))}
+    assert {row["cell"]: row for row in tables.rows_of("near_h100.jsonl")} == read
+
+
+def test_the_figure_has_a_point_for_each_number(tmp_path):
+    pytest.importorskip("matplotlib")
+    series = tables.points_of_bonsai()
+    assert {"alpha", "smoe"} == {blend for _, blend in series}
+    assert [round(number, -3) for number, _ in series["importance", "alpha"]] == [
+        1000, 3000, 10000, 30000, 100000, 256000, 512000]
+    tables.draw(str(tmp_path / "figure.png"))
+    assert (tmp_path / "figure.png").stat().st_size > 10_000

@@ -59,7 +59,9 @@ def load_setup():
     return module
 
 
-def test_links_of_the_tree_that_a_zip_left_as_text_are_made_again(tmp_path):
+@pytest.mark.parametrize("as_text", [True, False])
+def test_links_of_the_tree_are_made_again(tmp_path, as_text):
+    """A .zip leaves them as text, an sdist leaves them out."""
     setup = load_setup()
     links = [path for package in ("diff_smoe_rasterization", "dsmoe") for path in (ROOT / package).iterdir()
              if path.is_symlink()]
@@ -67,11 +69,24 @@ def test_links_of_the_tree_that_a_zip_left_as_text_are_made_again(tmp_path):
     for link, target in setup.LINKS.items():
         path = tmp_path / link
         path.parent.mkdir()
-        path.write_text(target)
+        if as_text:
+            path.write_text(target)
         (tmp_path / path.name).mkdir()
     for _ in range(2):
         setup.restore_links(tmp_path)
         assert all((tmp_path / link).samefile(tmp_path / Path(link).name) for link in setup.LINKS)
+
+
+def test_an_sdist_holds_each_file_of_the_linked_folders_once(tmp_path):
+    pytest.importorskip("setuptools")
+    subprocess.run([sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)], cwd=str(ROOT),
+                   check=True, stderr=subprocess.PIPE)
+    names = next(tmp_path.glob("*.egg-info/SOURCES.txt")).read_text().splitlines()
+    for folder in ("integrations", "patches"):
+        held = [name for name in names if f"/{folder}/" in f"/{name}" and not name.startswith("tests/")]
+        there = [path for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".md")]
+        assert f"{folder}/README.md" in held
+        assert sorted(held) == sorted(path.relative_to(ROOT).as_posix() for path in there)
 
 
 def test_a_build_does_not_write_into_a_loaded_library(tmp_path):
@@ -183,7 +198,7 @@ def test_cmake_is_told_what_torch_and_the_environment_say(tmp_path, monkeypatch)
     tools = SimpleNamespace(**{**vars(setup.import_build_tools()[1]), "CUDA_HOME": folder})
 
     def options(release, cxx11_abi, with_cuda=True):
-        fake = SimpleNamespace(**{**vars(torch_of("12.8")), "__version__": release,
+        fake = SimpleNamespace(**{**vars(torch_of("12.8")), "__version__": release, "__file__": torch.__file__,
                                   "compiled_with_cxx11_abi": lambda: cxx11_abi})
         return setup.options_of_cmake(fake, tools, with_cuda=with_cuda, stable=False)
 

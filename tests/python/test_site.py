@@ -35,6 +35,23 @@ def test_every_link_of_a_page_leads_somewhere(stage):
     assert not missing
 
 
+def anchors(page):
+    """The anchors of a page's headings, as code hosts and the site make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = (re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", line) for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+    return {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
+def test_every_link_into_a_page_leads_to_a_heading(stage):
+    links = [(page, *link) for page in stage.markdown_files()
+             for link in re.findall(r"\]\(((?!https?:)[^)#\s]*)#([^)\s]+)\)", page.read_text(encoding="utf-8"))]
+    assert len(links) > 100
+    missing = [f"{page.relative_to(ROOT)}: {target}#{anchor}" for page, target, anchor in links
+               if (page.parent / target).suffix == ".md" and anchor not in anchors(page.parent / target)
+               or not target and anchor not in anchors(page)]
+    assert not missing
+
+
 def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
     from dsmoe.arguments import build_parser
 
@@ -217,3 +234,40 @@ def test_the_program_runs():
     assert variables["color"].shape == (3, 240, 320) and variables["color"].max() > 0.1
     assert (variables["radii"] > 0).any() and variables["radii"].shape == (1000,)
     assert variables["means3D"].grad.any() and variables["means2D"].grad.any()
+
+
+def test_what_a_patch_writes_into_a_checkout_is_public():
+    from dsmoe.patches import fuse, modernise, runtime
+    from dsmoe.patches.trainers import TRAINERS
+
+    public = (ROOT / "DEVELOPING.md").read_text(encoding="utf-8").partition("**Frozen")[2].partition("\n## ")[0]
+    frozen = {name: set(re.findall(r"`(\w+)`", names)) for name, names in re.findall(
+        r"^- `([\w.]+)`: (.*?)(?=^- )", public, re.MULTILINE | re.DOTALL)}
+    patchable = [trainer for trainer in TRAINERS if trainer.entries]
+    assert frozen["dsmoe.patches.runtime"] == {
+        "chosen_blend", *(trainer.default for trainer in TRAINERS),
+        *(entry.blend for trainer in TRAINERS for entry in trainer.entries)}
+    assert frozen["diff_smoe_rasterization.integrations"] == {trainer.flavour for trainer in patchable}
+    assert all(callable(getattr(runtime, name)) for name in frozen["dsmoe.patches.runtime"])
+    assert callable(fuse.start) and callable(modernise.start)
+
+
+def test_every_page_has_the_version_of_the_package():
+    from diff_smoe_rasterization import __version__
+
+    for page, pattern, times in (("CITATION.cff", r"^version: (.*)$", 1), ("docs/install.md", r"/v([\d.]+)$", 2),
+                                 ("docs/install.md", r"diff_smoe_rasterization-([\d.]+)\+", 1),
+                                 ("CHANGELOG.md", r"^## (.*)$", 1)):
+        found = re.findall(pattern, (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+        assert found[:times] == [__version__] * times, f"{page}: {found}"
+
+
+def test_the_first_table_of_the_readme_has_rows_of_the_results():
+    rows = re.findall(r"^\| (.*?) \| ([\d.]+) \| ([\d,]+)", README.read_text(encoding="utf-8"), re.MULTILINE)[:5]
+    results = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    table = results.partition("## Trainers side by side")[2].partition("\n## ")[0]
+    assert len(rows) == 5
+    for name, seconds, number in rows:
+        short = f"{int(number.replace(',', '')) / 1000:.0f}k"
+        assert any(re.search(rf"\b{seconds}\b", line) and (short in line or "1.03 M" in line)
+                   for line in table.splitlines() if line.startswith("|")), f"{name}: {seconds} s, {short}"

@@ -85,7 +85,8 @@ def attach(tmp_path):
 @pytest.mark.parametrize("no_release", [0, 1])
 def test_the_wheels_are_attached_to_the_release_of_the_tag(attach, no_release):
     tag = f"v{__version__}"
-    names = [f"diff_smoe_rasterization-{__version__}+{kind}-cp310-abi3-linux_x86_64.whl" for kind in ("cpu", "cu13")]
+    stem = f"diff_smoe_rasterization-{__version__}"
+    names = [f"{stem}+{kind}-cp310.cp312-none-linux_x86_64.whl" for kind in ("cpu", "cu13")]
     status, errors, calls = attach(tag, *names, no_release=no_release)
     assert status == 0, errors
     made = [call for call in calls if call[1] == "create"]

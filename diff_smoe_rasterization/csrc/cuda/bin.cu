@@ -77,12 +77,8 @@ bool needs_depth_order(BlendMode mode) {
 
 template <class S> void count_instances(const Frame<S>& frame, const Work& work) {
   const int64_t num_gaussians = frame.inputs.num_gaussians;
-  const int64_t enough = int64_t(kEnoughWarpsPerMultiprocessor) * num_multiprocessors();  // to keep the device busy
   CountArguments<S> arguments = {};
-  arguments.gaussians_per_warp = kWarp;
-  while (arguments.gaussians_per_warp > 1 && num_gaussians < enough * arguments.gaussians_per_warp) {
-    arguments.gaussians_per_warp /= 2;
-  }
+  arguments.gaussians_per_warp = rows_per_warp(num_gaussians, 1);
   arguments.mode = frame.config.blend.mode;
   arguments.grid = TileGrid(frame.camera.width, frame.camera.height);
   arguments.saved = frame.saved;

@@ -1,8 +1,8 @@
-// How much memory the tile instances of a rendering get, before the GPU has counted them. The counts of earlier
-// renderings of the same size, mode and order of N, per Gaussian, are a good guess; a bad one costs time, never
-// correctness (rasterize_cuda.h). The background's gate is no part of the key: of a tensor the host does not know it.
-// A count is forgotten after a thousand renderings or two, so that one large view does not enlarge the key sort and the
-// memory for ever. This table of sizes is all that outlives a call.
+// How much memory the tile instances of a rendering get, before the GPU has counted them. The guess is the number of
+// instances per Gaussian of earlier renderings with the same image size, mode and about as many Gaussians. A bad guess
+// costs time, never correctness (rasterize_cuda.h). The background's gate is no part of the key, because the host does
+// not know the value of a tensor. A count is forgotten after 1,024 to 2,048 renderings, so that one large view does not
+// enlarge the key sort and the memory for ever. This table of sizes is all that outlives a call.
 #pragma once
 
 #include <cuda_runtime_api.h>

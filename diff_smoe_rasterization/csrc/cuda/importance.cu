@@ -203,8 +203,8 @@ __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& argum
   }
 }
 
-// Moves the pixels to the begin of a segment. A is what all w (c - C) and lambda T (bg - C), which are 0 together, have
-// in front of it.
+// Moves the pixels to the begin of a segment. A is the sum of w (c - C) in front of it. That is minus the sum behind
+// it, with lambda T (bg - C), because over a whole pixel they sum to 0.
 template <class S, BlendMode kMode, int kChannels>
 __device__ __forceinline__ void move_to_segment(const ImportanceArguments<S>& arguments, const WarpTile<S>& tile,
                                                 int segment, WeighedPixels<S, kChannels>& pixels) {

@@ -1,4 +1,5 @@
-// Lazy Adam: a warp finds the rows to bring up to date among 32, and each half of it takes every other one of them.
+// Lazy Adam: a warp finds the rows to bring up to date among up to 32, and each half of it takes every other one of
+// them.
 #include <algorithm>
 
 #include "../refuse_training.h"
@@ -16,24 +17,25 @@ constexpr int kWarps = kAdamBlock / kWarp;
 constexpr int kRowLanes = 16;
 constexpr int kRowNumbers = 3;
 
+// Missed steps that are interleaved: a step's root and reciprocal do not wait for those of the step before.
+constexpr int kStepUnroll = 4;
+
 // Blocks that one multiprocessor holds at once: of floats, so many that enough loads are in flight.
 template <class S> constexpr int kBlocks = sizeof(S) == 4 ? 4 : 1;
 
-// Where a number of each row lies: one column of one tensor.
+// Where a number of each row lies: one column of one tensor. Its arrays are looked up in the kernel's arguments, since
+// their addresses would fill the registers.
 template <class S> struct Column {
-  LazyAdamTensor<S> tensor;  // that begins at the column
-  const AdamRates<S>* rates;
+  int tensor, place;  // in the row; column 0 of tensor 0 where it does not exist
   bool exists;
 
   // column: counted over all tensors.
   __device__ Column(const LazyAdam<S>& adam, int column) {
-    int t = 0;
-    while (t < adam.num_tensors && column >= adam.tensors[t].row_size) column -= adam.tensors[t++].row_size;
-    exists = t < adam.num_tensors;
-    if (!exists) return;
-    tensor = adam.tensors[t];
-    tensor.parameter += column, tensor.moment += column, tensor.square += column, tensor.gradient += column;
-    rates = adam.rates + t;
+    tensor = 0, place = column;
+    while (tensor < adam.num_tensors && place >= adam.tensors[tensor].row_size)
+      place -= adam.tensors[tensor++].row_size;
+    exists = tensor < adam.num_tensors;
+    if (!exists) tensor = place = 0;
   }
 };
 
@@ -41,49 +43,51 @@ template <class S> struct Column {
 template <class S>
 __device__ void catch_up_row(const LazyAdam<S>& adam, const Column<S> (&columns)[kRowNumbers], int64_t row,
                              LazyAdamMark mark, int32_t steps) {
-  S gradient[kRowNumbers], parameter[kRowNumbers] = {}, moment[kRowNumbers] = {}, square[kRowNumbers] = {};
+  S gradient[kRowNumbers], parameter[kRowNumbers], moment[kRowNumbers], square[kRowNumbers];
 #pragma unroll
   for (int k = 0; k < kRowNumbers; ++k) {
+    gradient[k] = parameter[k] = moment[k] = square[k] = S(0);
     if (!columns[k].exists) continue;
-    const LazyAdamTensor<S>& tensor = columns[k].tensor;
-    const int64_t i = row * tensor.row_size;
-    gradient[k] = mark.waiting ? tensor.gradient[i] : S(0);
+    const LazyAdamTensor<S>& tensor = adam.tensors[columns[k].tensor];
+    const int64_t i = row * tensor.row_size + columns[k].place;
+    if (mark.waiting) gradient[k] = tensor.gradient[i];
     parameter[k] = tensor.parameter[i], moment[k] = tensor.moment[i], square[k] = tensor.square[i];
   }
-  int32_t step = mark.steps;
+  const AdamRates<S>* rates = adam.rates + int64_t(mark.steps) * adam.num_tensors;
+  int32_t missed = steps - mark.steps;
   if (mark.waiting) {
 #pragma unroll
     for (int k = 0; k < kRowNumbers; ++k) {
-      if (!columns[k].exists) continue;
-      adam_step(adam.constants, columns[k].rates[step * adam.num_tensors], gradient[k], parameter[k], moment[k],
-                square[k]);
+      adam_step(adam.constants, rates[columns[k].tensor], gradient[k], parameter[k], moment[k], square[k]);
     }
-    ++step;
+    rates += adam.num_tensors, --missed;
   }
-#pragma unroll 1
-  for (; step < steps; ++step) {
+#pragma unroll kStepUnroll
+  for (int32_t step = 0; step < missed; ++step) {
 #pragma unroll
     for (int k = 0; k < kRowNumbers; ++k) {
-      if (!columns[k].exists) continue;
-      adam_rest_step(adam.constants, columns[k].rates[step * adam.num_tensors], parameter[k], moment[k], square[k]);
+      adam_rest_step(adam.constants, rates[step * adam.num_tensors + columns[k].tensor], parameter[k], moment[k],
+                     square[k]);
     }
   }
 #pragma unroll
   for (int k = 0; k < kRowNumbers; ++k) {
     if (!columns[k].exists) continue;
-    const LazyAdamTensor<S>& tensor = columns[k].tensor;
-    const int64_t i = row * tensor.row_size;
+    const LazyAdamTensor<S>& tensor = adam.tensors[columns[k].tensor];
+    const int64_t i = row * tensor.row_size + columns[k].place;
     tensor.parameter[i] = parameter[k], tensor.moment[i] = moment[k], tensor.square[i] = square[k];
   }
 }
 
+// rows: of a warp, 2 to 32.
 template <class S>
-__global__ void __launch_bounds__(kAdamBlock, kBlocks<S>) catch_up_kernel(const __grid_constant__ LazyAdam<S> adam) {
+__global__ void __launch_bounds__(kAdamBlock, kBlocks<S>)
+    catch_up_kernel(const __grid_constant__ LazyAdam<S> adam, int rows) {
   __shared__ int32_t shared_rows[kWarps][kWarp], shared_marks[kWarps][kWarp];
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  const int64_t row = int64_t(blockIdx.x) * kAdamBlock + threadIdx.x;
+  const int64_t row = (int64_t(blockIdx.x) * kWarps + warp) * rows + lane;
   const int32_t steps = adam.num_steps();
-  const bool wanted = row < adam.num_rows && (adam.radii == nullptr || adam.radii[row] > 0);
+  const bool wanted = lane < rows && row < adam.num_rows && (adam.radii == nullptr || adam.radii[row] > 0);
   const int32_t mark = wanted ? adam.marks[row] : steps;
   const unsigned stale = __ballot_sync(kAllLanes, mark != steps);
   if (stale == 0) return;
@@ -119,8 +123,9 @@ __global__ void __launch_bounds__(kStoreBlock) note_step_kernel(const __grid_con
 template <class S> void catch_up(const LazyAdam<S>& adam, void* stream) {
   refuse_catch_up("cuda::catch_up", adam);
   if (adam.num_rows == 0) return;
-  const unsigned blocks = blocks_for(adam.num_rows, kAdamBlock);
-  catch_up_kernel<<<blocks, kAdamBlock, 0, static_cast<cudaStream_t>(stream)>>>(adam);
+  const int rows = rows_per_warp(adam.num_rows, kWarp / kRowLanes);
+  const unsigned blocks = blocks_for(adam.num_rows, kWarps * rows);
+  catch_up_kernel<<<blocks, kAdamBlock, 0, static_cast<cudaStream_t>(stream)>>>(adam, rows);
   DSMOE_CHECK_LAUNCH("lazy Adam");
 }
 

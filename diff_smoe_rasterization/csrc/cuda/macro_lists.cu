@@ -316,8 +316,8 @@ template <class S> struct TestArguments {
   S tail_reach;           // of BlendRules
   bool near_first;        // squares are those that near pairs meet
   uint64_t* squares;      // [entries] written: which squares the footprint meets
-  uint64_t* listed;       // [entries] written: those too that only wide pixels have pairs or tails in; null where
-                          // they are the same
+  uint64_t* listed;       // [entries] written: squares with any pair or tail, also if only wide pixels have it; null
+                          // if these are the same
   uint32_t* tile_counts;  // [tiles] entries of each tile; zero before
 };
 
@@ -405,8 +405,8 @@ struct TileOffsetArguments {
   LookBack look_back;      // zero before
   EntryCount entries;      // of macro tiles
   int64_t* offsets;        // [tiles + 1] written
-  int64_t* num_instances;  // [1] written: the room that instances and entries need; where the entries did not fit, they
-  uint32_t* longer;        // [kLengthClasses] tiles of longer classes are added; zero before
+  int64_t* num_instances;  // [1] written: the room needed, the larger of the numbers of instances and of entries
+  uint32_t* longer;        // [kLengthClasses] zero before; gets the number of tiles in longer classes
   int32_t* segment_queue;  // its counter is set to 0; or null
 };
 

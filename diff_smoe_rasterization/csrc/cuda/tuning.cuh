@@ -8,6 +8,18 @@
 namespace dsmoe {
 namespace cuda {
 
+// A warp that takes up to 32 rows takes fewer where a multiprocessor would get less than this many warps: half of the
+// 64 that it can hold, enough to hide the latency of loads.
+constexpr int kEnoughWarpsPerMultiprocessor = 32;
+
+// How many rows a warp takes: 32, 16, ... or `least`.
+inline int rows_per_warp(int64_t rows, int least) {
+  const int64_t enough = int64_t(kEnoughWarpsPerMultiprocessor) * num_multiprocessors();
+  int count = kWarp;
+  while (count > least && rows < enough * count) count /= 2;
+  return count;
+}
+
 // The tile walk.
 //
 // A warp's square of pixels, each way. Half a tile: a footprint is tested against few pixels, so that most pairs that
@@ -60,9 +72,6 @@ static_assert(kTensorBatch == kVisitsPerCheck, "the walk says where a batch ends
 // Threads a block. Large blocks, because the look-back goes from block to block.
 constexpr int kListBlock = 256;
 constexpr int kListWarps = kListBlock / kWarp;
-// A warp takes up to 32 Gaussians, and fewer where a multiprocessor would get less than this many warps: half of the 64
-// that it can hold, enough to hide the latency of loads.
-constexpr int kEnoughWarpsPerMultiprocessor = 32;
 
 // Sorts by radix, and the lists of macro tiles.
 //

@@ -25,10 +25,8 @@ inline cudaStream_t current_stream() {
         library == nullptr ? nullptr : dlsym(library, "aoti_torch_get_current_cuda_stream"));
   }();
   DSMOE_CHECK(function != nullptr, "PyTorch's CUDA library is not loaded");
-  int32_t device;
-  check_call(aoti_torch_get_current_device_index(&device), "get_current_device_index");
   void* stream;
-  check_call(function(device, &stream), "get_current_cuda_stream");
+  TORCH_ERROR_CODE_CHECK(function(torch::stable::accelerator::getCurrentDeviceIndex(), &stream));
   return static_cast<cudaStream_t>(stream);
 }
 #endif

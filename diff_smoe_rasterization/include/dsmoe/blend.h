@@ -48,7 +48,7 @@ template <BlendMode kMode> using ModeConstant = std::integral_constant<BlendMode
 template <BlendMode... kModes> struct ModeList {
   static constexpr int kSize = sizeof...(kModes);
 
-  // Calls body(ModeConstant<kMode>{}) for each mode. A body for the host is no mistake: nvcc need not warn of it.
+  // Calls body(ModeConstant<kMode>{}) for each mode. A body may be a host function: the pragma silences nvcc's warning.
 #ifdef __CUDACC__
 #pragma nv_exec_check_disable
 #endif

@@ -12,10 +12,10 @@ constexpr float kFaintBelowOfMode = -std::numeric_limits<float>::infinity();
 
 template <class S> struct BlendRules {
   BlendMode mode = BlendMode::kAlpha;
-  S alpha_min = 0;        // SMoE modes: also skip alpha below this; kSmoe: such pairs are no strong ones
+  S alpha_min = 0;        // SMoE modes: pairs with alpha below this do not count; in kSmoe they are tails
   S background_gate = 0;  // lambda of kSmoe and kSmoeEq7, 0 or more
-  // kSmoe, kSmoeEq7: faint pairs and tails count where the gate sum of near ones is less; 2: everywhere, 0: nowhere;
-  // kFaintBelowOfMode: as it is usual in the mode
+  // kSmoe, kSmoeEq7: faint pairs and tails count in pixels whose near pairs have a smaller gate sum than this: with 2
+  // in all, with 0 in none; kFaintBelowOfMode: the mode's default
   S faint_below = S(kFaintBelowOfMode);
   const S* background_gate_at = nullptr;  // [1] where lambda lies instead, or null
 

@@ -127,9 +127,9 @@ struct Run {
   StageTimes* times = nullptr;  // is added to, or null; the pass then waits for its kernels
 };
 
-// Renders frame.inputs to frame.images and fills frame.saved. The first call of a size, mode and order of N waits for
-// the number of instances. So does every call with `times`, every one whose likely instances, with some room, exceed
-// config.most_instances, and every pass over a rendering that has more than those.
+// Renders frame.inputs to frame.images and fills frame.saved. A call waits for the number of instances (a) the first
+// time for an image size, a mode and about so many Gaussians, (b) with `times`, (c) if the instances that it expects,
+// with some room, exceed config.most_instances. So does every pass over a rendering with more instances than that.
 template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);
 
 // Writes gradients.inputs. `frame` is as `forward` left it.

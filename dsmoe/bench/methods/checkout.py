@@ -18,7 +18,8 @@ import torch
 
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, GATED_MODES
 
-from ...config import TrainConfig
+from ...config import LEARNED, TrainConfig
+from ...patches.runtime import STAND_INS
 from ...results.evaluation import Evaluation, summary
 from ...results.pictures import evenly_spaced
 from ...scenes.images import View
@@ -138,7 +139,9 @@ class ThreeDGS:
 
     def environment(self) -> Dict[str, str]:
         ours = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-        path = [item for item in [*self.method["pythonpath"], *ours] if item]
+        # The observer imports the trainer's modules before the script has called modernise.start().
+        stand_ins = [str(STAND_INS)] * (self.method["variant"] != "unpatched")
+        path = [item for item in [*self.method["pythonpath"], *ours, *stand_ins] if item]
         environment = {name: value for name, value in os.environ.items()
                        if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, "PYTHONSAFEPATH")}
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -254,7 +257,9 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
                    train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
                    are_gaussians=shape.of_gaussians,
                    commit=shape.method.get("commit") or commit_of(shape.method["path"]), renders=renders,
-                   notes={"ground_truth_difference": difference, **shape.rules()})
+                   notes={"ground_truth_difference": difference, **shape.rules(),
+                          **({"background_gate": rendered["background_gate"]} if config.background_gate == LEARNED
+                             else {})})
 
 
 def portable(words: List[str]) -> List[str]:

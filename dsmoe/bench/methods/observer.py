@@ -6,8 +6,9 @@ It runs in the trainer's own Python and imports nothing of this project. It reli
 they seed with constants, show their loop as a tqdm bar over the iterations, and render by
 `gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`) or `model.render(view)["render"]`.
 
-RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, milliseconds, file, truth}]. The files of the
-renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
+RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, background_gate, views [{name, milliseconds, file, truth}]. The
+files of the renderings are arrays [3, H, W] of float32, unclamped, in FOLDER. The gate is a learned one, as it is when
+the script ends; null where nothing was rendered with such a gate.
 """
 import argparse
 import importlib.abc
@@ -60,7 +61,13 @@ def main():
         peak = torch.cuda.max_memory_allocated() / 2 ** 20 if torch.cuda.is_available() else None
         with open(options.record, "w") as file:
             json.dump({"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
-                       "num_gaussians": views.pop("num_gaussians", None), "views": list(views.values())}, file)
+                       "num_gaussians": views.pop("num_gaussians", None), "background_gate": learned_gate(),
+                       "views": list(views.values())}, file)
+
+
+def learned_gate():
+    module = sys.modules.get("diff_smoe_rasterization.learned_gate")
+    return module.gate.value() if module and module.gate.blend_mode and module.gate.is_known else None
 
 
 def synchronise():

@@ -75,13 +75,16 @@ def row_of(cell, output):
 
 
 def test_a_patched_checkout_gives_a_row(small, tmp_path):
-    row = row_of(small("3dgs-2023"), tmp_path)
+    """Its learned gate is the one that render.py found in the model."""
+    row = row_of(small("3dgs-2023", background_gates=["learned"]), tmp_path)
     assert row["ok"], row["reason"]
     assert (row["method"], row["variant"], row["blend_mode"]) == ("3dgs-2023", "patched", "smoe")
     assert all(row[figure] > 0 for figure in ("psnr", "psnr_float", "ssim", "fps", "num_gaussians"))
     protocol = row["protocol"]
     assert protocol["strategy"] == row["strategy"] == "3dgs" and protocol["recipe"] == {}
     assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == 3
+    assert row["background_gate"] == "learned" and 0.05 < protocol["background_gate"] < 0.2
+    assert protocol["background_gate"] != 0.1  # it starts there
     assert 0 < row["train_seconds"] < row["wall_seconds"]
     # The ground truth was rounded to 8 bits on its way here: a quarter of a grey level on average.
     assert 0 < row["protocol"]["ground_truth_difference"] < 0.5 / 255

@@ -144,13 +144,14 @@ def test_densification_between_the_backward_pass_and_the_step_loses_no_step():
 
 
 @pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
-def test_gradients_that_the_trainer_drops_do_not_count():
+@pytest.mark.parametrize("set_to_none", [True, False])
+def test_gradients_that_the_trainer_drops_do_not_count(set_to_none):
     """A pass for scores: a backward pass, then zero_grad without a step."""
     view, gaussians = scene()
     optimizer = torch.optim.SGD(gaussians.values(), lr=0)
     slope = gradient_at(START, view, gaussians)
     (1000 * loss(view, gaussians)).backward()
-    optimizer.zero_grad(set_to_none=True)
+    optimizer.zero_grad(set_to_none=set_to_none)
     loss(view, gaussians).backward()
     optimizer.step()
     second = gradient_at(gate.value(), view, gaussians)
@@ -170,6 +171,37 @@ def test_an_optimizer_that_is_none_of_torchs_counts_too():
     for tensor in gaussians.values():
         tensor.grad = None
     loss(view, gaussians)
+    assert gate.value() == pytest.approx(by_hand([slope]), rel=1e-5)
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+def test_an_edit_of_the_centres_is_no_step_of_their_optimizer():
+    """A trainer may keep them in a box between two renderings of a step."""
+    view, gaussians = scene()
+    optimizer = torch.optim.SGD(gaussians.values(), lr=0)
+    loss(view, gaussians).backward()
+    optimizer.step()  # from now on it is known
+    optimizer.zero_grad()
+    before = gate.value()
+    for _ in range(2):
+        loss(view, gaussians).backward()
+        with torch.no_grad():
+            gaussians["means3D"].clamp_(-100, 100)
+        assert gate.value() == before
+    optimizer.step()
+    assert gate.value() != before
+
+
+def test_a_gate_of_0_that_was_found_is_rendered_until_the_first_step():
+    """A script that renders a model without torch.no_grad() shows it as the model's file says."""
+    view, gaussians = scene()
+    optimizer = torch.optim.SGD(gaussians.values(), lr=0)
+    gate.found(0.0)
+    shown = image(view, gaussians)
+    assert torch.equal(shown, image(view._replace(background_gate=0.0), gaussians)) and gate.value() == 0
+    slope = gradient_at(0.0, view, gaussians)
+    shown.square().mean().backward()
+    optimizer.step()
     assert gate.value() == pytest.approx(by_hand([slope]), rel=1e-5)
 
 

@@ -19,6 +19,7 @@ from dsmoe.scenes.scene import load_scene
 from dsmoe.train import train
 from dsmoe.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
 from dsmoe.training.passes import AutogradPasses
+from dsmoe.training.strategy import Look
 from dsmoe.training.trainer import Trainer
 
 
@@ -111,7 +112,12 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, strategy, kille
 
 def looking(trainer, monkeypatch):
     """The strategy after steps over every training view that changed no Gaussian."""
-    monkeypatch.setattr(trainer.strategy, "_looks", lambda step: True)
+
+    def looks_at(iteration, views):
+        trainer.strategy._looked = views
+        return [0]
+
+    monkeypatch.setattr(trainer.strategy, "looks_at", looks_at)
     monkeypatch.setattr(trainer.strategy, "after_backward", lambda step: None)
     monkeypatch.setattr(trainer.optimizer, "step", lambda: None)
     for _ in trainer.scene.train:
@@ -123,13 +129,13 @@ def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
     """Removals at 16, 19, 22, 25. Of the five views that each wants, what the steps before do not show is rendered."""
     trainer = trainer_of(tiny_config, strategy="importance", budget=60, strategy_options="removals=4,views=5")
     strategy, log = trainer.strategy, {}
-    look = strategy._look
+    add = strategy._add
 
-    def logged(view, *rest):
+    def logged(view, look):
         log.setdefault(trainer.iteration, []).append(view.camera.name)
-        look(view, *rest)
+        add(view, look)
 
-    monkeypatch.setattr(strategy, "_look", logged)
+    monkeypatch.setattr(strategy, "_add", logged)
     while trainer.iteration < 25:
         trainer.step()
     decisions = (16, 19, 22, 25)
@@ -152,8 +158,7 @@ def test_a_decision_looks_at_the_first_of_each_group_of_neighbours(tiny_config):
         in_order = groups[first:] + groups[:first]
         sizes = [in_order.count(group) for group in range(4)]
         assert in_order == sorted(in_order) and max(sizes) - min(sizes) <= 1 < max(sizes)
-        splats = SimpleNamespace(importance=lambda *_: SimpleNamespace(removal_costs=0, shares=0))
-        strategy._look(views[first], views[first].image, views[first].image_float(), splats)
+        strategy._add(views[first], Look(torch.zeros_like(strategy.costs), torch.zeros_like(strategy.errors)))
         assert strategy.sought == {view.camera.name: group for view, group in zip(views, groups) if group}
     assert len(beginnings) > 2
 
@@ -287,7 +292,7 @@ def test_removal_takes_what_floats_in_front_of_a_camera(tiny_config, monkeypatch
 
 def test_what_floats_in_front_of_a_camera_moves(tiny_config, monkeypatch):
     """Whatever it costs, and nothing moves there; in parts of the Gaussians as at once."""
-    monkeypatch.setattr("dsmoe.training.importance_strategy.ROWS_AT_ONCE", 9)
+    monkeypatch.setattr("dsmoe.training.importance_strategy.NUMBERS_AT_ONCE", 99)
     trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     strategy, count = trainer.strategy, trainer.model.num_gaussians
     floating(trainer, [20, 50])
@@ -427,7 +432,7 @@ def test_mcmc_regularises_opacities_and_scales(tiny_config):
     gradients = torch.autograd.grad(expected, [raw["opacities"], raw["scales"]])
     passes = AutogradPasses(trainer.model, trainer.optimizer, trainer.renderer)
     with torch.no_grad():
-        trainer.strategy.after_backward(SimpleNamespace(add_gradient=passes._add_gradient))
+        trainer.strategy.after_backward(SimpleNamespace(batch=1, add_gradient=passes._add_gradient))
     torch.testing.assert_close(raw["opacities"].grad, gradients[0])
     torch.testing.assert_close(raw["scales"].grad, gradients[1])
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import json
 import os
 import re
 import shutil
@@ -44,6 +45,15 @@ def torchrun(processes, *words, **environment):
     return result.returncode, result.stdout, result.stderr
 
 
+def words_of(config):
+    """The options of a training on the command line."""
+    names = ("batch", "budget", "strategy", "strategy_options", "iterations", "blend_mode", "sh_degree_interval",
+             "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
+             "densify_grad_threshold", "checkpoint_every")
+    return [config.scene, "-o", config.output, "--quiet",
+            *(f"--{name.replace('_', '-')}={getattr(config, name)}" for name in names)]
+
+
 def model_of(config):
     with open(model_path(config.output, config.iterations), "rb") as file:
         return file.read()
@@ -52,32 +62,50 @@ def model_of(config):
 @needs_gloo
 @needs_torchrun
 def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
-    """Two processes train until one dies; from what they saved, three go on, and one does. 40 views in steps of 4."""
-    straight = tiny_config.changed(batch=4, output=str(tmp_path / "straight"))
+    """Two processes train until one dies; from what they saved, three go on, and one does. 60 views in steps of 4.
+
+    Growth is until 16, removals at 16, 19, 22, 25, moves until 40, an average from 42 on.
+    """
+    straight = tiny_config.changed(batch=4, output=str(tmp_path / "straight"), iterations=60, budget=60,
+                                   strategy_options="removals=4,views=5,moves=0.2", strategy="importance")
     row = train(straight, progress=False)
     config = dataclasses.replace(straight, output=str(tmp_path / "several"))
-    words = [config.scene, "-o", config.output, "--quiet", *(
-        word for name in ("batch", "iterations", "blend_mode", "sh_degree_interval", "densify_from_iter",
-                          "densify_until_iter", "densification_interval", "opacity_reset_interval",
-                          "densify_grad_threshold", "checkpoint_every")
-        for word in ("--" + name.replace("_", "-"), str(getattr(config, name))))]
-    status, out, errors = torchrun(2, os.path.join(HERE, "dying_worker.py"), "train", *words, DYING_AT="32")
+    status, out, errors = torchrun(2, os.path.join(HERE, "dying_worker.py"), "train", *words_of(config), DYING_AT="56")
     assert status != 0 and "process 1: this process dies" in errors, errors
     assert out.count("in 2 processes") == 1
-    assert not os.path.exists(model_path(config.output, 40)) and os.path.isfile(config.output + "/checkpoint.pt")
+    assert not os.path.exists(model_path(config.output, 60)) and os.path.isfile(config.output + "/checkpoint.pt")
     alone = dataclasses.replace(config, output=str(tmp_path / "alone"))
     shutil.copytree(config.output, alone.output)
 
     status, out, errors = torchrun(3, "-m", "dsmoe", "train", "--resume", "-o", config.output)
     assert status == 0, errors
-    # The last checkpoint before 32: densifications were at 8 and 16, and one at 24 follows.
-    assert "resumed at iteration 20" in out or "resumed at iteration 28" in out
+    assert "resumed at iteration 52" in out
     assert model_of(config) == model_of(straight)
-    assert row["num_gaussians"] != row["protocol"]["init_points"]
+    assert row["num_gaussians"] == 60
 
     torch.manual_seed(77)
     assert train(alone, resume=True, progress=False)["psnr"] == row["psnr"]
     assert model_of(alone) == model_of(straight)
+
+
+@needs_gloo
+@needs_torchrun
+def test_three_processes_decide_as_one(tiny_config, tmp_path):
+    """Splits, clones, prunes and resets of 3dgs; relocation, growth and noise of mcmc. The test above has importance.
+
+    Of mcmc's steps, which have two views, one process blends nothing.
+    """
+    options = [dict(batch=4), dict(batch=2, strategy="mcmc", budget=200, blend_mode="alpha", densification_interval=4,
+                                   opacity_lr=1.0)]  # so that some die
+    configs = [tiny_config.changed(**each, output=str(tmp_path / f"one_{index}"))
+               for index, each in enumerate(options)]
+    others = [config.changed(output=str(tmp_path / f"three_{index}")) for index, config in enumerate(configs)]
+    rows = [train(config, progress=False) for config in configs]
+    assert rows[0]["num_gaussians"] != rows[0]["protocol"]["init_points"] and rows[1]["num_gaussians"] == 200
+    status, _, errors = torchrun(3, os.path.join(HERE, "several_trainings.py"),
+                                 *(json.dumps(config.record()) for config in others))
+    assert status == 0, errors
+    assert [model_of(config) for config in others] == [model_of(config) for config in configs]
 
 
 @needs_gloo
@@ -207,8 +235,16 @@ def test_processes_that_do_not_meet_say_so(monkeypatch, capsys):
 
 def test_more_gpus_than_there_are_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(TrainerError, match="--gpus is 3; it must be at least 1 and at most 2"):
-        torchrun_module.check_gpus(3, "cuda")
+    for asked in ("3", "0", "-1", "all"):
+        with pytest.raises(TrainerError, match=f"--gpus is {asked}; it must be auto, or at least 1 and at most 2"):
+            torchrun_module.chosen_gpus(asked, "cuda", 4)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
-    with pytest.raises(TrainerError, match="torch finds no GPU here; on CPUs start torchrun with --device cpu"):
-        torchrun_module.check_gpus(3, "cuda")
+    for asked in ("3", "auto"):
+        with pytest.raises(TrainerError, match="torch finds no GPU here; on CPUs start torchrun with --device cpu"):
+            torchrun_module.chosen_gpus(asked, "cuda", 4)
+
+
+@pytest.mark.parametrize("batch, gpus", [(1, 1), (3, 3), (8, 4)])
+def test_auto_takes_all_gpus_that_a_batch_keeps_busy(monkeypatch, batch, gpus):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert torchrun_module.chosen_gpus("auto", "cuda", batch) == gpus

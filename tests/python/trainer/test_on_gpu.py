@@ -102,6 +102,25 @@ def test_captured_steps_give_the_bits_of_launched_ones(config, scene, monkeypatc
         assert launched.background_gate == other.background_gate
 
 
+@pytest.mark.parametrize("always", [False, True])
+def test_without_memory_for_a_capture_the_bits_stay(config, scene, monkeypatch, capsys, always):
+    """Torch refuses the first pool, which asks for a petabyte and more; the next one too, or else that is captured."""
+    monkeypatch.setattr(graphs, "WARM_UP", 3)
+    launched, short = (Trainer(dataclasses.replace(config, deterministic=True), scene) for _ in range(2))
+    launched.passes._graphs, of_short = graphs.NoGraphs(), short.passes._graphs
+    of_short._bytes = 2.0**50
+    if always:
+        monkeypatch.setattr(graphs.CudaGraphs, "_free", lambda self, free=graphs.CudaGraphs._free: (
+            free(self), setattr(self, "_bytes", 2.0**50)))
+    for trainer in (launched, short):
+        torch.manual_seed(7)
+        steps_of(trainer, 20)
+    assert (of_short._keeper is None) == always
+    assert ("no memory for steps as CUDA graphs" in capsys.readouterr().err) == always
+    for name in PARAMETERS:
+        assert torch.equal(launched.model.raw[name], short.model.raw[name]), name
+
+
 @pytest.mark.parametrize("options", [dict(), dict(background_gate="learned", random_background=True)])
 def test_a_step_does_not_wait_for_the_device(config, scene, monkeypatch, options):
     monkeypatch.setattr(graphs, "WARM_UP", 12)  # launched, captured and replayed below
@@ -198,16 +217,27 @@ def test_a_deterministic_training_to_a_budget_repeats_bit_for_bit(config, scene)
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_two_gpus_train_the_bits_of_one(config, tmp_path):
-    config = config.changed(batch=4, deterministic=True, output=str(tmp_path / "one"))
+@pytest.mark.parametrize("options", [
+    dict(), dict(strategy="mcmc", budget=170),
+    dict(strategy="importance", budget=60, iterations=60, strategy_options="removals=4,views=5,moves=0.2")], ids=str)
+def test_two_gpus_train_the_bits_of_one(config, tmp_path, options):
+    """From the same start, and from a checkpoint of one GPU. The background's gate is learned."""
+    config = config.changed(batch=4, deterministic=True, output=str(tmp_path / "one"), checkpoint_every=20, **options)
+    others = [dataclasses.replace(config, output=str(tmp_path / folder)) for folder in ("two", "resumed")]
     train(config, progress=False)
-    words = ["train", config.scene, "-o", str(tmp_path / "two"), "--gpus", "2", "--quiet", "--deterministic"]
-    for name in ("batch", "iterations", "blend_mode", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
-                 "densification_interval", "opacity_reset_interval", "densify_grad_threshold"):
-        words += ["--" + name.replace("_", "-"), str(getattr(config, name))]
-    assert main(words) == 0
+    broken = Run(new_trainer(others[1], load_scene(config, progress=False)), progress=False)
+    os.makedirs(others[1].output)
+    others[1].save(others[1].output)
+    steps_of(broken.trainer, 5)
+    broken.save_checkpoint()
+    words = ["train", config.scene, "-o", others[0].output, "--gpus", "2", "--quiet", "--deterministic"]
+    for name in ("batch", "budget", "strategy", "strategy_options", "iterations", "blend_mode", "sh_degree_interval",
+                 "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
+                 "densify_grad_threshold"):
+        words.append(f"--{name.replace('_', '-')}={getattr(config, name)}")
+    assert main(words) == 0 and main(["train", "--resume", "-o", others[1].output, "--gpus", "2", "--quiet"]) == 0
     models = []
-    for folder in ("one", "two"):
-        with open(model_path(str(tmp_path / folder), config.iterations), "rb") as file:
+    for each in (config, *others):
+        with open(model_path(each.output, config.iterations), "rb") as file:
             models.append(file.read())
-    assert models[0] == models[1]
+    assert models[0] == models[1] == models[2]

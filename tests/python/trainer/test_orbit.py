@@ -135,17 +135,19 @@ def test_an_orbit_needs_no_scene(model, tmp_path):
     assert image.shape == (600, 800, 3) and (image > 0).any(axis=2).mean() > 0.2, "the model is in the picture"
 
 
-def test_a_gif_has_every_frame(model, tiny_scene, tmp_path, capsys):
-    assert orbit(model, tmp_path / "a.gif", "--scene", tiny_scene, "--fps", "10") == 0
-    assert "a.gif: 3 frames, 0.3 s" in capsys.readouterr().out
-    with Image.open(tmp_path / "a.gif") as film:
-        assert (film.n_frames, film.size, film.info["duration"]) == (3, (32, 24), 100)
-    assert sorted(os.listdir(tmp_path)) == ["a.gif", "model.ply"]
-    (tmp_path / "a.gif").write_text("mine")
-    assert orbit(model, tmp_path / "a.gif", "--scene", tiny_scene) == 1
-    assert "a.gif is there already" in capsys.readouterr().err and (tmp_path / "a.gif").read_text() == "mine"
-    assert orbit(model, tmp_path / "a.gif", "--scene", tiny_scene, "--overwrite") == 0
-    assert Image.open(tmp_path / "a.gif").n_frames == 3
+@pytest.mark.parametrize("name", ["a.gif", "a.webp"])
+def test_a_loop_has_every_frame(model, tiny_scene, tmp_path, capsys, name):
+    assert orbit(model, tmp_path / name, "--scene", tiny_scene, "--fps", "10") == 0
+    assert f"{name}: 3 frames, 0.3 s" in capsys.readouterr().out
+    with Image.open(tmp_path / name) as film:
+        film.load()
+        assert (film.n_frames, film.size, film.info["duration"]) == (3, (32, 24), 100) and film.info["loop"] == 0
+    assert sorted(os.listdir(tmp_path)) == [name, "model.ply"]
+    (tmp_path / name).write_text("mine")
+    assert orbit(model, tmp_path / name, "--scene", tiny_scene) == 1
+    assert f"{name} is there already" in capsys.readouterr().err and (tmp_path / name).read_text() == "mine"
+    assert orbit(model, tmp_path / name, "--scene", tiny_scene, "--overwrite") == 0
+    assert Image.open(tmp_path / name).n_frames == 3
 
 
 def test_an_mp4_plays_every_frame(tmp_path):
@@ -162,7 +164,8 @@ def test_an_mp4_plays_every_frame(tmp_path):
 
 @pytest.mark.parametrize("output, arguments, text", [
     ("a.gif", ["--depth"], "a video has room for colours only"), ("a", ["--frames", "0"], "--frames is 0"),
-    ("a.gif", ["--fps", "0"], "--fps is 0"), ("a.mov", [], "a video can end in .mp4 or .gif; .mov is not written")])
+    ("a.gif", ["--fps", "0"], "--fps is 0"),
+    ("a.mov", [], "a video can end in .mp4, .gif or .webp; .mov is not written")])
 def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, arguments, text):
     assert orbit(model, tmp_path / output, *arguments) == 1
     assert text in capsys.readouterr().err and not (tmp_path / output).exists()

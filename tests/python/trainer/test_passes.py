@@ -113,6 +113,54 @@ def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypa
         assert_equal(trainers[0], other)
 
 
+class Starved(Repeats):
+    """Whose captures fail in their second part: as often as `failures`, and with `too_many` Gaussians or more."""
+
+    def __init__(self, failures, too_many, words="CUDA out of memory. Tried to allocate 2.00 GiB"):
+        super().__init__()
+        self.failures, self.too_many, self.words, self.parts, self.attempts = failures, too_many, words, 0, []
+
+    def _new(self, num_gaussians, capture):
+        self.parts = 0
+        self.attempts.append(num_gaussians)
+        return super()._new(num_gaussians, capture)
+
+    def _record(self, function):
+        self.parts += 1
+        if self.parts == 2 and (self.failures > 0 or self.attempts[-1] >= self.too_many):
+            self.failures -= 1
+            raise RuntimeError(self.words)
+        return super()._record(function)
+
+
+@pytest.mark.parametrize("failures, too_many", [(1, 10_000), (0, 61)])
+def test_without_memory_for_a_capture_steps_are_launched(tiny_config, scene, monkeypatch, capsys, failures, too_many):
+    """Once more with all other graphs gone, then only with fewer Gaussians: here those behind the removals."""
+    monkeypatch.setattr("dsmoe.training.graphs.WARM_UP", 3)
+    config = tiny_config.changed(strategy="importance", budget=60, strategy_options="views=3,moves=0.2", iterations=50)
+    launched, starved = (trained(config, scene, True, 0, graphs) for graphs in (None, Starved(failures, too_many)))
+    for trainer in (launched, starved):
+        torch.manual_seed(5)
+        for _ in range(config.iterations):
+            trainer.step()
+    graphs = starved.passes._graphs
+    assert graphs.replays > 30
+    said = capsys.readouterr().err
+    if failures:
+        assert graphs.attempts[0] == graphs.attempts[1] and not said
+    else:
+        refused = [count for count in graphs.attempts if count > 60]
+        assert len(refused) == 2 and min(graphs.attempts) == 60 and said.count("\n") == 1
+        assert f"at {refused[0]} Gaussians the GPU has no memory for steps as CUDA graphs" in said
+    assert_equal(launched, starved)
+
+
+def test_another_error_of_a_capture_is_raised(tiny_config, scene, monkeypatch):
+    monkeypatch.setattr("dsmoe.training.graphs.WARM_UP", 3)
+    with pytest.raises(RuntimeError, match="another one"):
+        trained(tiny_config, scene, True, 20, Starved(1, 10_000, "another one"))
+
+
 def test_who_reads_the_model_finds_it_up_to_date(tiny_config, scene):
     """At any time, and reading changes nothing of what follows."""
     quiet, disturbed = (Trainer(tiny_config, scene) for _ in range(2))

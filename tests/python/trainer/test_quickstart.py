@@ -7,6 +7,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -16,6 +17,9 @@ from diff_smoe_rasterization.io import read_gaussians
 from dsmoe import cli, quickstart, short_run
 from dsmoe.results.pictures import MARGIN, comparison, evenly_spaced, window_of_differences
 from dsmoe.system import files
+
+sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "..", "benchmarks"))
+import compare_runs  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +54,18 @@ def test_pictures_show_truth_and_both_modes(output):
     assert pictures == ["compare_view_000.png", "compare_view_008.png"]
     with Image.open(output / pictures[0]) as picture:
         assert picture.width > 3 * 400 and np.asarray(picture).std() > 10
+
+
+def test_two_runs_are_shown_beside_the_photograph_of_a_view(output, tiny_scene, tmp_path, capsys):
+    runs = [str(output / mode) for mode in ("alpha", "smoe")]
+    compare_runs.main([*runs, "-o", str(tmp_path / "a.png"), "--view", "view_008.png", "--width", "300"])
+    with Image.open(tmp_path / "a.png") as picture, Image.open(output / "compare_view_008.png") as expected:
+        wanted = np.asarray(expected.resize(picture.size, Image.LANCZOS), np.float64)
+        differs = np.abs(np.asarray(picture, np.float64) - wanted).mean(axis=(1, 2))
+    assert picture.width == 300 and not differs[len(differs) // 10:].any(), "below the labels, which have other words"
+    with pytest.raises(SystemExit):
+        compare_runs.main([*runs, "-o", str(tmp_path / "b.png"), "--view", "view_001.png"])
+    assert "--view view_001.png: the test views are view_000.png, view_008.png" in capsys.readouterr().err
 
 
 def test_the_table_and_a_second_run(tiny_scene, output, capsys):

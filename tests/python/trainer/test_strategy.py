@@ -40,7 +40,7 @@ def context_of(scales, opacities, **options):
         state = optimizer.adam.state[model.raw[name]]
         for key in ("exp_avg", "exp_avg_sq"):
             state[key] += rows.view(-1, *[1] * (model.raw[name].dim() - 1))
-    return StrategyContext(config, model, optimizer, EXTENT, [], lambda camera: None)
+    return StrategyContext(config, model, optimizer, EXTENT, [], lambda camera: None, iter)
 
 
 def moments(context, name, key="exp_avg"):
@@ -55,7 +55,7 @@ def observed_step(context, iteration, gradients, radii=None):
     values = torch.tensor(gradients)
     by_place = torch.stack([0.6 * values, -0.8 * values, torch.full_like(values, 99.0)], dim=1)
     radii = torch.ones(len(gradients), dtype=torch.int32) if radii is None else torch.tensor(radii, dtype=torch.int32)
-    step = Step(iteration, 1, torch.zeros(()))
+    step = Step(iteration, 1, torch.zeros(()), lambda name, number: None)
     step.seen.append((by_place, radii))
     return step
 
