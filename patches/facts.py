@@ -41,6 +41,7 @@ USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its raster
 CALLED_SO = {"depth": ("depth",), "alpha": ("alpha",), "opacity": ("alpha",), "median_depth": ("median_depth",),
              "inverse_depth": ("", "inverse_depth", "depth"), "language_feature": ("", "language_feature",
                                                                                    "feature_map")}
+SAID = {result for result, _ in WORDS} | set(CALLED_SO)
 OF_ONE = (*USES, "returns ", "may return ")  # kinds of facts that are about one rasterizer
 FOUR_COLUMNS = "means2D of four columns"
 STILL = "this package would not blend so; --trainer NAME takes it all the same, such as --trainer inria"
@@ -360,7 +361,7 @@ def _fits(found: str, contract: Contract) -> bool:
     names, taken = found.split(", "), {f"takes {name}" for name in contract.arguments}
     return any(len(names) == len(results) and all(
         name.startswith("_") or RESULTS.get(result, ("", ""))[1] in name.lower()
-        and _meaning(name, taken) in CALLED_SO.get(result, ("", result))
+        and (result not in SAID or _meaning(name, taken) in CALLED_SO.get(result, ("", result)))
         for name, result in zip(names, results)) for results in (contract.results, *contract.other_results))
 
 

@@ -183,6 +183,8 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "langsplat": ("include_feature=1", "language_feature_precomp=1", "image, feature_image, radii"),
     "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, mask_image, radii, depth"),
     "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
+    "taming": ("pixel_weights=1", "dc=1", "image, radii, counts, lists, listsRender, listsDistance, centers, depths, "
+               "my_radii, accum_weights, accum_count, accum_blend, accum_dist"),
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
     "lucid_dreamer": ("", "", "image, radii, depth_alpha"),  # no depth: one image has both
     "nearest_points": ("nearest_points=1", "", "image, radii"),
