@@ -151,7 +151,8 @@ def build_parser() -> argparse.ArgumentParser:
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--background-gate", "--background_gate", metavar="V",
                      help="how much the background weighs: a number, 0 in the paper, or `learned` (default: "
-                          "$DSMOE_BACKGROUND_GATE, else learned in smoe, 0 in smoe_eq7); models record it")
+                          "$DSMOE_BACKGROUND_GATE, else learned in smoe, 0 in smoe_eq7); models record it. smoe with "
+                          "0 is the program of the paper's authors, not Eq. 7 of its text, which is smoe_eq7 with 0")
     run.add_argument("--trainer", metavar="NAME",
                      help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
                           "(inria, inria_2024, scaffold, ...); default: found out from the script's folder")

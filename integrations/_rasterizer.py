@@ -148,7 +148,8 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
     if own.get("depth_threshold") and points is not None:
         depths = (inputs["means3D"] @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]).detach()
         factors = (depths / own["depth_threshold"]).square().clamp(max=1)
-        inputs["means2D"] = scaled_gradients(factors, {"": points})[""]
+        inputs.update({name: scaled_gradients(factors, {"": inputs[name]})[""] for name in ("means2D", "means2D_abs")
+                       if name in inputs})
     theta, rho = inputs.pop("theta", None), inputs.pop("rho", None)
     if theta is not None or rho is not None:
         settings = _moved(settings, theta, rho)

@@ -152,7 +152,8 @@ def ordered(results: Tuple[str, ...]) -> Contract:
     if len(set(results)) < len(results) or not {"color", "radii"} <= set(results) <= {name for name, _ in WORDS}:
         raise KeyError(",".join(results))
     return Contract(",".join(results), "rasterizers whose results come in this order", results, FREE_SETTINGS,
-                    (*ARGUMENTS, "dc", *FREE_ARGUMENTS), methods=FREE_METHODS)
+                    (*ARGUMENTS, "dc", *FREE_ARGUMENTS), ("SparseGaussianAdam", "compute_relocation"),
+                    methods=FREE_METHODS)
 
 
 def contract_of(name: str) -> Contract:

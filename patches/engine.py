@@ -132,6 +132,9 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     below = facts.below(root)
     if below:
         reason, chosen = below[0], None
+    elif known and facts.blocked(found):
+        also = ", ".join(sorted(facts.blocked(found)))
+        reason, chosen = f"it imports {also} too, another rasterizer, which no patch replaces: {_by_run(before)}", None
     elif chosen is not None and (not chosen.entries or others):
         by = f" ({', '.join(sorted(renamed))})" if renamed else ""
         reason = reason or f"its rasterizer is {chosen.flavour}{by}, for which there is no patch: {_by_run(before)}"

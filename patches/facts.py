@@ -12,7 +12,9 @@ from diff_smoe_rasterization.integrations import contracts
 from diff_smoe_rasterization.integrations.contracts import (
     ARGUMENTS,
     CONTRACTS,
+    FEATURES,
     NAMES,
+    NO_MEANING,
     RASTERIZER,
     REFUSED,
     RESULTS,
@@ -21,23 +23,27 @@ from diff_smoe_rasterization.integrations.contracts import (
 )
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
+from . import callers
+from .callers import MODULES, OF_GSPLAT, OTHER, OURS, RENAMED, THEIRS
 from .source import PatchError, tree_of
 from .trainers import GR, INTEGRATIONS, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS
 FOLDER = GR.partition("/")[0]
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
-OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel|plane)")
 IMPORTS_RASTERIZER = re.compile(rb"(?m)^\s*((from|import) (\w*diff_(gauss|surfel|plane)|gsplat\b)"
                                 rb"|from (?!diff_smoe_)\w+ import .*GaussianRasteriz)")
-FOREIGN = re.compile("|".join(contracts.FOREIGN))
 SPARSE_ADAM, ASKS_FOR_SPARSE_ADAM = "SparseGaussianAdam", "sparse_adam"
 BY_DEFAULT = re.compile(rb"\boptimizer_type\s*(:\s*\w+\s*)?=\s*['\"]" + ASKS_FOR_SPARSE_ADAM.encode())
 USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its rasterizer is called with",
         "needs ": "it imports", "asks ": "its rasterizer has a method"}
-OF_GSPLAT = "gsplat"
+# What names of a result may say: these must say it, and others may say nothing.
+CALLED_SO = {"depth": ("depth",), "alpha": ("alpha",), "opacity": ("alpha",), "median_depth": ("median_depth",),
+             "inverse_depth": ("", "inverse_depth", "depth"), "language_feature": ("", "language_feature",
+                                                                                   "feature_map")}
+SAID = {result for result, _ in WORDS} | set(CALLED_SO)
+OF_ONE = (*USES, "returns ", "may return ")  # kinds of facts that are about one rasterizer
 FOUR_COLUMNS = "means2D of four columns"
-MODULES = {contract.module: contract for contract in CONTRACTS if contract.module not in (RASTERIZER, OF_GSPLAT)}
 STILL = "this package would not blend so; --trainer NAME takes it all the same, such as --trainer inria"
 OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their names"
 
@@ -61,7 +67,7 @@ def calls_some(facts: Set[str]) -> bool:
 
 def packages(facts: Set[str]) -> Set[str]:
     """Returns the packages that are imported as a rasterizer of Inria's kind."""
-    return those(facts, "from ") | those(facts, "renamed ")
+    return (those(facts, "from ") | those(facts, "renamed ")) - {OF_GSPLAT}
 
 
 def _reached(files: Mapping[str, bytes], start: Sequence[str]) -> Dict[str, bytes]:
@@ -110,17 +116,18 @@ def _of_each(files: Mapping[str, bytes]) -> Dict[str, Set[str]]:
     facts: Dict[str, Set[str]] = {}
     for file, data in files.items():
         try:
-            nodes = list(ast.walk(tree_of(data)))
+            tree = tree_of(data)
         except PatchError:
             continue
+        nodes = list(ast.walk(tree))
         in_try = {id(node) for outer in nodes if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        shown = facts[file] = {*_of_rasterizers(nodes), *_of_gsplat(nodes)}
-        settings_names = {alias.asname for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names
-                          if alias.name == NAMES[0]} | {NAMES[0]}
+        later = in_try | {id(node) for outer in nodes if isinstance(outer, (ast.FunctionDef, ast.If))
+                          for node in ast.walk(outer)}
+        shown = facts[file] = {*callers.of_rasterizers(tree, local), *_of_gsplat(nodes)}
         for node in nodes:
             if isinstance(node, (ast.Import, ast.ImportFrom)):
-                shown.update(_of_import(node, id(node) in in_try, local))
+                shown.update(_of_import(node, id(node) in in_try, id(node) in later, local))
             elif isinstance(node, ast.ClassDef) and node.name in NAMES:
                 shown.add("defines " + node.name)
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
@@ -128,9 +135,7 @@ def _of_each(files: Mapping[str, bytes]) -> Dict[str, Set[str]]:
             elif isinstance(node, ast.Assign) and _has_four_columns(node):
                 shown.add(FOUR_COLUMNS)
             elif isinstance(node, ast.Call):
-                called = getattr(node.func, "attr", getattr(node.func, "id", ""))  # the last part of the name
-                settings = node.keywords if called in settings_names else ()
-                shown.update([f"calls {called}", *(f"sets {keyword.arg}" for keyword in settings if keyword.arg)])
+                shown.add(f"calls {callers.last_name(node.func)}")
     return facts
 
 
@@ -142,32 +147,29 @@ def _has_four_columns(node: ast.Assign) -> bool:
                 and any(getattr(size, "value", None) == 4 for size in shapes))
 
 
-def _of_import(node: Any, may_fail: bool, local: Set[str]) -> Iterator[str]:
+def _of_import(node: Any, may_fail: bool, later: bool, local: Set[str]) -> Iterator[str]:
+    """may_fail: it is in a `try`. later: it is run only if its branch or function is."""
     names = [alias.name for alias in node.names]
     is_whole = isinstance(node, ast.Import)
     for module in names if is_whole else [node.module or ""]:
-        package, is_ours = module.partition(".")[0], module.startswith(INTEGRATIONS + ".")
-        is_theirs = package == RASTERIZER or package in MODULES
-        brings = not is_whole and not node.level and not {*names}.isdisjoint(NAMES[:2])
-        is_other = not is_ours and not is_theirs and package not in local and bool(
-            brings or OTHER_RASTERIZER.search(package))
-        is_renamed = is_other and "gauss" in package and not FOREIGN.search(package)
+        package, kind = module.partition(".")[0], callers.kind_of(node, module, local)
         yield "imports " + module.rpartition(".")[2]
-        if is_ours:
+        if kind == OURS:
             yield PATCHED
-        elif is_theirs:
-            yield "from " + package
-        elif is_renamed:
-            yield "renamed " + package
-        elif is_other:
-            yield "uses " + package
+        elif kind == OTHER:
+            yield f"{'may use' if later else 'uses'} {package}"
+        elif kind:
+            yield f"{kind} {package}"
+            yield f"{'perhaps' if later else 'always'} {package}"
         elif package == OF_GSPLAT:
             yield "has gsplat"
-        if not is_whole and (is_ours or is_theirs or is_renamed or module in ("", FOLDER)):
+        is_rasterizer = kind in (THEIRS, RENAMED)
+        if not is_whole and (kind and kind != OTHER or module in ("", FOLDER)):
             yield from (f"imports {name}" for name in names)
-        if not is_whole and (is_theirs or is_renamed) and not may_fail:
+        if not is_whole and is_rasterizer and not may_fail:
             prefix = "" if module == package else module + "."
-            yield from (f"needs {prefix}{name}" for name in names if name != "*")
+            yield from (text for name in names if name != "*"
+                        for text in callers.tagged(package, f"needs {prefix}{name}"))
 
 
 def _of_gsplat(nodes: Sequence[ast.AST]) -> Iterator[str]:
@@ -194,38 +196,11 @@ def _of_gsplat(nodes: Sequence[ast.AST]) -> Iterator[str]:
             yield "calls gsplat's " + function
 
 
-def _of_rasterizers(nodes: Sequence[ast.AST]) -> Iterator[str]:
-    """Calls of objects, rasterizer(...) and GaussianRasterizer(...)(...) by whatever names, and of their methods."""
-    classes = {alias.asname or alias.name for node in nodes if isinstance(node, ast.ImportFrom)
-               for alias in node.names if alias.name.startswith("GaussianRasterizer")}
-    calls = [node for node in nodes if isinstance(node, ast.Call)]
-    made = [call for call in calls if getattr(call.func, "id", "") in classes]
-    assigned = [node for node in nodes if isinstance(node, ast.Assign)]
-    objects = {getattr(target, "id", "") for node in assigned if node.value in made for target in node.targets}
-    objects |= {"rasterizer"} if classes else set()
-    owners = [*made, *(node for node in nodes if getattr(node, "id", None) in objects)]
-    for call in calls:
-        keywords = [keyword.arg for keyword in call.keywords if keyword.arg]  # without **pipe.blend
-        if call.func in owners and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
-            yield from (f"takes {name}" for name in keywords)
-        elif isinstance(call.func, ast.Attribute) and call.func.value in owners:
-            yield "asks " + call.func.attr
-    for node in assigned:
-        results = getattr(node.targets[0], "elts", ())
-        is_plain = results and not any(isinstance(one, ast.Starred) for one in results)
-        if is_plain and getattr(node.value, "func", None) in owners:
-            yield "returns " + ", ".join(getattr(one, "id", "_") for one in results)
-    for function in (node for node in nodes if isinstance(node, ast.FunctionDef)):  # out = rasterizer(...); a, b = out
-        lines = [node for node in ast.walk(function) if isinstance(node, ast.Assign)]
-        kept = {getattr(line.targets[0], "id", "") for line in lines if getattr(line.value, "func", None) in owners}
-        for line in lines:
-            results = getattr(line.targets[0], "elts", ())
-            if results and getattr(line.value, "id", None) in kept - {""}:  # it may depend on len(out)
-                yield "may return " + ", ".join(getattr(one, "id", "_") for one in results)
-
-
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
-    """Returns the rasterizer whose API is called and "", or None and why it is none that is known."""
+    """Returns the rasterizer whose API is called and "", or None and why it is none that is known.
+
+    Of several it is that of RASTERIZER's name, or else the first.
+    """
     foreign = sorted(those(facts, "uses "))
     if foreign:
         return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
@@ -236,47 +211,99 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
         beside, reason = contract_of(facts - {"from " + OF_GSPLAT})
         is_beside = not facts.isdisjoint("imports " + name for name in NAMES)
         return (None, reason) if is_beside and not beside else (contracts.contract_of(OF_GSPLAT), "")
-    others = [contract for name, contract in MODULES.items() if "from " + name in facts]
     if facts.isdisjoint("imports " + name for name in NAMES):
-        called = sorted(those(facts, "calls gsplat's "))
+        others = [contract for name, contract in MODULES.items() if "from " + name in facts]
+        called, later = (sorted(those(facts, kind)) for kind in ("calls gsplat's ", "may use "))
         instead = f"; it calls {', '.join(called)}" if called else ""
         return (others[0], "") if others else (None, f"it imports gsplat and does not call its rasterization{instead}"
-                                               if "has gsplat" in facts else f"nothing imports {NAMES[0]} from "
-                                               f"{RASTERIZER} or {INTEGRATIONS}")
+                                               if "has gsplat" in facts else f"it imports {', '.join(later)}, another "
+                                               "rasterizer, and none that is known" if later else
+                                               f"nothing imports {NAMES[0]} from {RASTERIZER} or {INTEGRATIONS}")
+    found, reason = contracts_of(facts)
+    return next(iter(found.values()), None), reason
+
+
+def contracts_of(facts: Set[str]) -> Tuple[Dict[str, Contract], str]:
+    """Returns for each package that is imported as a rasterizer which one it is, and "".
+
+    Where one of them is none that is known: {} and why. One whose name is unknown too, and that is imported only in a
+    branch or a function, beside another that always is, is left out: see `blocked`.
+    """
+    imported = sorted(packages(facts), key=lambda name: (name != RASTERIZER, name)) or [RASTERIZER]
+    found, reasons = {}, {}
+    for package in imported:
+        own = callers.of_package(facts, package, OF_ONE) if len(imported) > 1 else facts
+        contract, reason = _contract_of(package, own)
+        if contract:
+            found[package] = contract
+        else:
+            reasons[package] = f"{package}: {reason}" if len(imported) > 1 else reason
+    always = those(facts, "always ")
+    needed = [reason for package, reason in reasons.items()
+              if package in always or package in MODULES or always.isdisjoint(found)]
+    return ({}, needed[0]) if needed else (found, "")
+
+
+def blocked(facts: Set[str]) -> Set[str]:
+    """Returns the packages of other rasterizers that are imported only in a branch or a function."""
+    return those(facts, "may use ") | (packages(facts) - set(contracts_of(facts)[0]))
+
+
+def is_own(package: str, flavour: str) -> bool:
+    """Whether a rasterizer is what its package's name says."""
+    return package in MODULES and MODULES[package].name == flavour
+
+
+def _contract_of(package: str, facts: Set[str]) -> Tuple[Optional[Contract], str]:
+    """Returns what `contract_of` does, for the facts of one package."""
     refused = next((reason for sign, reason in REFUSED.items() if sign in facts), None)
     if refused:
         return None, refused
     used = {kind + name for kind in USES for name in those(facts, kind)}
-    for kind, text in USES.items():
-        names = those(used - set().union(*map(_known, CONTRACTS)), kind)
-        if names:
-            return None, f"{text} {', '.join(sorted(names))}, which no rasterizer has that is known here"
-    shown = others or [contract for contract in CONTRACTS if contract.module == RASTERIZER
-                       and (not contract.signs or facts & set(contract.signs))]
-    fitting = [contract for contract in shown if used <= _known(contract)]
+    free = contracts.ordered(("color", "radii"))
+    unknown = used - set().union(*map(_known, (*CONTRACTS, free)))
     returned, perhaps = sorted(those(facts, "returns ")), sorted(those(facts, "may return "))
-    if those(facts, "renamed ") and not returned + perhaps:
-        return None, (f"it imports {', '.join(sorted(those(facts, 'renamed ')))}, and what a call returns is not seen: "
-                      f"if it has the API of a rasterizer that is known here, name that one by --trainer; {OF_ALL}")
+    if unknown:
+        return None, _told(unknown) + ", which no rasterizer has that is known here"
+    if package != RASTERIZER and package not in MODULES and not returned + perhaps:
+        return None, (f"it imports {package}, and what a call returns is not seen: if it has the API of a rasterizer "
+                      f"that is known here, name that one by --trainer; {OF_ALL}")
+    named = [MODULES[package]] if package in MODULES else []  # its name may be that of one, and its API another's
+    shown = named + [contract for contract in CONTRACTS if contract.module == RASTERIZER
+                     and (not contract.signs or facts & set(contract.signs))] * bool(returned + perhaps or not named)
+    fitting = [contract for contract in shown if used <= _known(contract)]
     longest = sorted(perhaps, key=lambda found: -found.count(",")) or [""]  # the most that code takes
     for kept, contract in itertools.product(longest, fitting):
         if all(_fits(found, contract) for found in returned) and (not kept or _fits(kept, contract)):
             has_columns = contract.name == "inria" and FOUR_COLUMNS in facts  # which the package's own API has not
             return contracts.ordered(("color", "radii")) if has_columns else contract, ""
-    if others and "from " + RASTERIZER not in facts:  # its name is that of one, and its API another's
-        names = {contract.module for contract in others}
-        contract = contract_of(facts - {"from " + name for name in names} | {"renamed " + name for name in names})[0]
-        if contract:
-            return contract, ""
-    orders = {_order(found) for found in returned}
-    if len(orders) == 1 and None not in orders and not others:
-        contract = contracts.ordered(*orders)  # type: ignore[arg-type]
-        if used <= _known(contract):
-            return contract, ""
-    nearest = (fitting or shown)[0]
-    found = next((found for found in [*returned, *perhaps] if not _fits(found, nearest)), "")
-    return None, (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which "
-                  f"it resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
+    orders = {_order(found, facts) for found in returned or longest[:1] * bool(perhaps)}
+    if len(orders) == 1 and None not in orders and used <= _known(free):
+        return contracts.ordered(*orders), ""  # type: ignore[arg-type]
+    return None, _clash(returned or perhaps, facts, used - _known(free), (fitting or shown)[0])
+
+
+def _clash(returned: Sequence[str], facts: Set[str], whole: Set[str], nearest: Contract) -> str:
+    """Says which facts do not go together. whole: what only comes with the results of one rasterizer."""
+    found = next((found for found in returned if not _fits(found, nearest)), "")
+    if not found:
+        return f"{_told(whole)}, which no rasterizer has together that is known here"
+    said = (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which it "
+            f"resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
+    blind = [name for name in found.split(", ") if not _meaning(name, facts)]
+    if whole:
+        return f"{said}, and {_told(whole)}, which come only with the results of a rasterizer that is known here"
+    if blind:
+        return f"{said}; what {', '.join(blind)} {'is' if len(blind) == 1 else 'are'}, no name or argument says"
+    if len({*returned}) > 1:
+        return f"{said}; other calls return {', or '.join(f'({other})' for other in returned if other != found)}"
+    return f"{said}; a name comes twice, or color or radii are not among them"
+
+
+def _told(used: Set[str]) -> str:
+    """Returns "its settings have X; its rasterizer is called with Y"."""
+    return "; ".join(f"{text} {', '.join(sorted(those(used, kind)))}" for kind, text in USES.items()
+                     if those(used, kind))
 
 
 def arguments_of_gsplat() -> Set[str]:
@@ -293,14 +320,27 @@ def arguments_of_gsplat() -> Set[str]:
     return taken | later
 
 
-def _order(found: str) -> Optional[Tuple[str, ...]]:
+def _order(found: str, facts: Set[str]) -> Optional[Tuple[str, ...]]:
     """Returns what results are, by what callers name them; None if a name does not say it, or two say the same."""
-    results = tuple(next((result for result, word in WORDS if re.search(word, name.lower())), "")
-                    for name in found.split(", "))
     try:
-        return contracts.ordered(results).results
+        return contracts.ordered(tuple(_meaning(name, facts) for name in found.split(", "))).results
     except KeyError:
         return None
+
+
+def _meaning(name: str, facts: Set[str]) -> str:
+    """Returns which result a name says, "" where it says none.
+
+    Features and normals are results only where the rasterizer is given some: else it computes them in its own way.
+    """
+    bare = re.sub(NO_MEANING, "", name.lower())
+    said = "" if name.startswith("_") else next((result for result, words in WORDS if re.fullmatch(
+        f"({words})s?", bare)), "")
+    given = [result for argument, (result, _) in FEATURES.items() if "takes " + argument in facts]
+    if said not in {result for result, _ in FEATURES.values()} or said in given:
+        return said
+    others = [result for result in given if result != "normal"]
+    return others[0] if said != "normal" and len(others) == 1 else ""
 
 
 def those(facts: Set[str], kind: str) -> Set[str]:
@@ -318,11 +358,11 @@ def _known(contract: Contract) -> Set[str]:
 
 def _fits(found: str, contract: Contract) -> bool:
     """Whether what a caller names its results by can be those of a rasterizer."""
-    names = found.split(", ")
+    names, taken = found.split(", "), {f"takes {name}" for name in contract.arguments}
     return any(len(names) == len(results) and all(
         name.startswith("_") or RESULTS.get(result, ("", ""))[1] in name.lower()
-        and not (result == "depth" and re.search("inv|alpha", name.lower())) for name, result in zip(names, results))
-        for results in (contract.results, *contract.other_results))
+        and (result not in SAID or _meaning(name, taken) in CALLED_SO.get(result, ("", result)))
+        for name, result in zip(names, results)) for results in (contract.results, *contract.other_results))
 
 
 def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:

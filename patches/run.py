@@ -25,8 +25,9 @@ from .runtime import RASTERIZER_VARIABLE, STAND_INS, USED_VARIABLE, WITHOUT_VARI
 from .source import PatchError
 from .trainers import GR, OF_AUTHORS, RASTERIZER, TRAINER_NAMES, TRAINERS
 
-RENAMED = "DSMOE_RUN_RENAMED"  # the names under which the trainer imports a rasterizer that is known
+PACKAGES = "DSMOE_RUN_PACKAGES"  # PACKAGE=FLAVOUR of what the trainer imports; without a flavour it is not to be used
 AS_RASTERIZER = "from dsmoe.patches import runtime\nglobals().update(runtime.rasterizer_of_run({0!r}))\n"
+AS_NOTHING = "raise ImportError('dsmoe run: {0} computes something else; this package cannot stand in for it')\n"
 AS_GSPLAT = "from dsmoe.patches import runtime\nruntime.gsplat_of_run()\n"
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 
@@ -44,7 +45,7 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
         print("dsmoe run: " + line, file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
         used, packages = Path(folder, "used"), Path(folder, "packages")
-        write_rasterizers(packages, list(filter(None, environment.pop(RENAMED, "").split(os.pathsep))))
+        write_rasterizers(packages, environment.pop(PACKAGES))
         environment["PYTHONPATH"] = os.pathsep.join([str(packages), environment["PYTHONPATH"]])
         try:
             child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)},
@@ -76,40 +77,58 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     folders = _folders(script)
     files = {folder: _read(folder, everywhere=folder == folders[0]) for folder in folders}
     flavour, where, warnings, found = _flavour(files, trainer, script)
-    module = contract_of(flavour).module
-    known_names = {name for name in facts.MODULES if module == RASTERIZER and "from " + name in found}
-    renamed = sorted(facts.those(found, "renamed ") | known_names)
-    named = flavour if module == RASTERIZER else "inria"  # beside another stands Inria's
-    if flavour == facts.OF_GSPLAT:  # unless what is beside it is known
-        beside = facts.contract_of(found - {"from " + facts.OF_GSPLAT})[0]
-        named = beside.name if beside and beside.module == RASTERIZER else named
+    flavours = _flavours(flavour, trainer, found)
+    named = flavours.get(RASTERIZER, "inria")  # beside another stands Inria's
+    renamed = sorted(set(flavours) - {RASTERIZER, *(name for name in flavours if facts.is_own(name, flavours[name]))})
+    blocked = sorted(facts.those(found, "may use ") if trainer else facts.blocked(found))
     path = [str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: named,
                    BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
-                   "PYTHONDONTWRITEBYTECODE": "1", RENAMED: os.pathsep.join(renamed)}  # no __pycache__ in the checkout
+                   "PYTHONDONTWRITEBYTECODE": "1",  # no __pycache__ in the checkout
+                   PACKAGES: os.pathsep.join([*(f"{name}={one}" for name, one in flavours.items()),
+                                              *(f"{name}=" for name in blocked)])}
     environment.setdefault("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # torch.load of checkpoints, which are tuples
     warnings += facts.of_one_name(folders[0])
-    if named == "inria_2024" and not _may_use_sparse_adam(words, files, found):
+    if (named == "inria_2024" or "," in named) and not _may_use_sparse_adam(words, files, found):
         environment[WITHOUT_VARIABLE] = facts.SPARSE_ADAM
     if renamed:
         why = "as --trainer says" if trainer else "since its calls fit"
         warnings += [f"{', '.join(renamed)} is taken for {RASTERIZER} under another name, {why}; if it computes "
                      "something else, that is not computed here"]
-        module = ", ".join([*renamed, *[module] * ("from " + module in found)])
-    if "," in flavour and flavour not in ("color,radii", trainer):
-        warnings += [f"the results are told by what the trainer calls them: {flavour}"]
+    warnings += [f"the results are told by what the trainer calls them: {one} ({name})"
+                 for name, one in flavours.items() if "," in one and one not in ("color,radii", trainer)]
+    warnings += [f"{name} computes something else: an import of it fails here" for name in blocked]
+    shown = {facts.OF_GSPLAT: flavour} if flavour == facts.OF_GSPLAT else flavours
+    will_be = ", ".join(f"{', '.join(name for name in shown if shown[name] == one)} will be {one}"
+                        for one in dict.fromkeys(shown.values()))
     blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
-    return environment, [f"{where}: {module} will be {flavour} of this package, blend mode {blend}; each process that "
+    return environment, [f"{where}: {will_be} of this package, blend mode {blend}; each process that "
                          "imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 
-def write_rasterizers(folder: Path, renamed: Sequence[str]) -> None:
-    """Makes the packages that a trainer imports as its rasterizer, each of one file, in a new folder.
+def _flavours(flavour: str, trainer: Optional[str], found: Set[str]) -> Dict[str, str]:
+    """Returns for each package that the trainer imports as its rasterizer what it will be.
 
-    renamed: further names, beside RASTERIZER, of the rasterizer that the trainer needs.
+    flavour: what --trainer names, or what the trainer was recognised by.
+    """
+    imported = facts.packages(found)
+    if not trainer:
+        return {name: one.name for name, one in facts.contracts_of(found)[0].items()} if imported else {}
+    own = contract_of(flavour).module
+    kept = {name: one.name for name, one in facts.MODULES.items() if name in imported and own in facts.MODULES}
+    given = dict.fromkeys(sorted(imported - set(kept)) or [own], flavour if own == RASTERIZER else "inria")
+    return {**given, **kept, **{own: flavour}} if own != facts.OF_GSPLAT else {}
+
+
+def write_rasterizers(folder: Path, packages: str) -> None:
+    """Makes the packages that a trainer may import as its rasterizer, each of one file, in a new folder.
+
+    packages: PACKAGE=FLAVOUR of what it imports, with os.pathsep between them.
     """
     texts = {module: AS_RASTERIZER.format(contract.name) for module, contract in facts.MODULES.items()}
-    texts.update({name: AS_RASTERIZER.format("") for name in (RASTERIZER, *renamed)})
+    texts[RASTERIZER] = AS_RASTERIZER.format("")
+    for name, _, flavour in (package.partition("=") for package in packages.split(os.pathsep) if package):
+        texts[name] = AS_RASTERIZER.format(flavour) if flavour else AS_NOTHING.format(name)
     for name, text in {**texts, facts.OF_GSPLAT: AS_GSPLAT}.items():
         (folder / name).mkdir(parents=True)
         (folder / name / "__init__.py").write_text(text)

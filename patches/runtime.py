@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import importlib
 import os
@@ -174,6 +175,13 @@ def _say_rasterizer(flavour: str) -> None:
         steps.register_optimizer_step_pre_hook(look)
 
 
+@functools.lru_cache(maxsize=None)
+def _modernise() -> None:
+    """Does once what --modernise does; a trainer without Pillow reads no images by it."""
+    with contextlib.suppress(ImportError):
+        importlib.import_module("dsmoe.patches.modernise").start()
+
+
 def rasterizer_of_run(flavour: str = "") -> Dict[str, Any]:
     """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
 
@@ -182,13 +190,17 @@ def rasterizer_of_run(flavour: str = "") -> Dict[str, Any]:
     """
     from diff_smoe_rasterization import GaussianRasterizer
     from diff_smoe_rasterization.integrations._rasterizer import classes_of
+    from diff_smoe_rasterization.integrations.contracts import contract_of
     flavour = flavour or os.environ[RASTERIZER_VARIABLE]
     if "," in flavour:
         names = "GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"
-        module: Any = types.SimpleNamespace(__all__=names, **dict(zip(names, classes_of(flavour, __name__))))
+        offered = {**vars(importlib.import_module("diff_smoe_rasterization.integrations.inria_2024")),
+                   **dict(zip(names, classes_of(flavour, __name__)))}
+        module: Any = types.SimpleNamespace(**{**offered, "__all__": [*names, *contract_of(flavour).names]})
     else:
         module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
     keep_records()
+    _modernise()
     if flavour == "c3dgs":  # it compresses a trained model, whose gate stays
         _begin_gate(frozen=True)
     GaussianRasterizer.__init__ = _noting(GaussianRasterizer.__init__)  # type: ignore[method-assign]

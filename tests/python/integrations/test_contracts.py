@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import importlib
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -27,10 +28,11 @@ from diff_smoe_rasterization.integrations import (
     monogs,
     nearest_points,
     pixel_gs,
+    scaffold,
     speedy_splat,
 )
 from diff_smoe_rasterization.integrations._rasterizer import classes_of
-from diff_smoe_rasterization.integrations.contracts import CONTRACTS, SETTINGS, contract_of
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES, SETTINGS, contract_of
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -160,8 +162,12 @@ def test_monogs_moves_the_camera_by_its_gradients():
     assert_close(without[0], color, 1e-9, "color without projmatrix_raw")
 
 
-FEATURES = [(grouping, "sh_objs", (N, 1, 5), {}, 2), (feature_3dgs, "semantic_feature", (N, 1, 5), {}, 1),
+NORMALS = ("color", "depth", "normal", "median_depth", "radii")  # as GSDF's rasterizer returns them
+WITH_NORMALS = SimpleNamespace(**dict(zip(NAMES, classes_of(",".join(NORMALS), __name__))))
+FEATURES = [(WITH_NORMALS, "normal_precomp", (N, 3), {}, 2),
+            (grouping, "sh_objs", (N, 1, 5), {}, 2), (feature_3dgs, "semantic_feature", (N, 1, 5), {}, 1),
             (langsplat, "language_feature_precomp", (N, 3), {"include_feature": True}, 1)]
+FREE = {"antialiasing": False, "clamp_color": True, "depth_threshold": 4.0, "include_feature": True}
 
 
 @pytest.mark.parametrize("module, name, shape, settings, place", FEATURES)
@@ -197,6 +203,42 @@ def test_features_that_are_not_wanted():
     assert not rendered(langsplat, scene, {"include_feature": False})[1].any()
     color, _, objects = rendered(grouping, scene)
     assert torch.equal(color, own(scene).color) and objects.numel() == 0
+
+
+def test_settings_features_and_results_combine_freely(mode):
+    """Each as it is alone: kernel_size, depth_threshold, two kinds of features, results in another order."""
+    names = ("normal", "radii", "alpha", "objects", "n_touched", "color", "is_used", "depth")
+    combined = SimpleNamespace(**dict(zip(NAMES, classes_of(",".join(names), __name__))))
+    scene, normals, objects = scene_of(mode), random_normal((N, 3), 87), random_normal((N, 1, 2), 88)
+    weights = random_normal((3, HEIGHT, WIDTH), 89)
+    points = torch.zeros(N, 3, dtype=torch.float64, requires_grad=True)
+    given = {**FREE, "kernel_size": 0.1, "subpixel_offset": None}
+    found = dict(zip(names, rendered(combined, scene, given, means2D=points, normal_precomp=normals, sh_objs=objects)))
+    (found["color"] * weights).sum().backward()
+    thin = scene.with_settings(low_pass=0.1, antialiasing=True)
+    for name, values in (("normal", normals), ("objects", objects)):
+        inputs = {key: tensor for key, tensor in scene.inputs.items() if key != "shs"}
+        black = thin.settings._replace(bg=torch.zeros(values.shape[-1], dtype=torch.float64))
+        expected = rasterize(settings=black, colors_precomp=values.reshape(N, -1), **inputs).color
+        assert expected.any()
+        assert_close(found[name], expected, TOLERANCE, name)
+    color, radii, depth, alpha = rendered(depth_alpha, thin)
+    for name, expected in (("color", color), ("depth", depth), ("alpha", alpha)):
+        assert_close(found[name], expected, TOLERANCE, name)
+    assert torch.equal(found["radii"], radii) and torch.equal(found["is_used"], (radii > 0).int())
+    _, absolute = sums_of_absolute_gradients(scene, weights, low_pass=0.1, antialiasing=True)
+    splats = rasterize_with_splats(settings=thin.settings, **scene.inputs)[1]
+    assert torch.equal(found["n_touched"], splats.contributions(torch.ones_like(color[0])).pixels)
+    factors = (splats.depths / 4.0).square().clamp(max=1)
+    assert (factors < 1).any()
+    assert_close(points.grad[:, 2], absolute.sum(1) * factors, TOLERANCE, "the third column")
+    rasterizer = combined.GaussianRasterizer(combined.GaussianRasterizationSettings(
+        **{**scene.settings._asdict(), "kernel_size": 0.1}))
+    visible = {name: scene.inputs[name] for name in ("means3D", "scales", "rotations")}
+    assert torch.equal(rasterizer.visible_filter(**visible) > 0,
+                       scaffold.GaussianRasterizer(thin.settings).visible_filter(**visible) > 0)
+    without = dict(zip(names, rendered(combined, scene)))
+    assert torch.equal(without["color"], own(scene).color) and not without["normal"].any()
 
 
 def test_cob_gs_renders_the_stage_without_masks(mode):

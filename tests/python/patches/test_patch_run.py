@@ -47,6 +47,8 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
 ENDS = {  # what a command does, and how `dsmoe run` ends then
     "made(None)": (0, ""), "pass": (1, "rendered nothing: what was trained or rendered was not smoe"),
     "import os, signal; os.kill(os.getpid(), signal.SIGKILL)": (137, ""),
+    "import numpy\nfrom PIL import Image\nmade(None)\n"  # as 3DGS loads Blender's scenes: new releases refuse both
+    "assert Image.fromarray(numpy.full((1, 1, 3), numpy.int(-1), numpy.byte)).getpixel((0, 0)) == (255,) * 3": (0, ""),
     "import contextlib, diff_gaussian_rasterization as d\nwith contextlib.suppress(TypeError): d.rasterize_gaussians()":
         (0, "")}
 
@@ -180,6 +182,8 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "langsplat": ("include_feature=1", "language_feature_precomp=1", "image, feature_image, radii"),
     "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, mask_image, radii, depth"),
     "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
+    "taming": ("pixel_weights=1", "dc=1", "image, radii, counts, lists, listsRender, listsDistance, centers, depths, "
+               "my_radii, accum_weights, accum_count, accum_blend, accum_dist"),
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
     "lucid_dreamer": ("", "", "image, radii, depth_alpha"),  # no depth: one image has both
     "nearest_points": ("nearest_points=1", "", "image, radii"),
@@ -207,6 +211,60 @@ def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(fl
     assert made["DSMOE_RASTERIZER"] == named and f"{module} will be {flavour} of this package" in lines[0]
 
 
+FREELY = {  # settings, keywords and results that no whole contract has
+    "depth,color,radii,alpha": ("kernel_size=1, subpixel_offset=2", "", "rendered_depth, image, radii, acc"),
+    "color,depth,normal,median_depth,radii": (
+        "clamp_color=1", "normal_precomp=1", "image, depths, render_normal, render_median_depth, radii"),
+    "color,radii,depth,feature_map": ("confidence=1", "semantic_feature=1", "image, radii, depth, features"),
+    "color,radii,depth": ("", "", "image, radii, depth")}
+
+
+@pytest.mark.parametrize("flavour", FREELY)
+def test_settings_and_results_combine_freely(flavour, tmp_path, monkeypatch):
+    settings, keywords, results = FREELY[flavour]
+    renderer = ("from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer\n"
+                f"draw = GaussianRasterizer(raster_settings=GaussianRasterizationSettings(bg=1, {settings}))\n"
+                f"{results} = draw(means3D=1, {keywords})\ndraw.visible_filter(means3D=1)\n")
+    monkeypatch.chdir(make(tmp_path, {GR: renderer}))
+    assert run.prepare([sys.executable, "train.py"], "smoe", None, environment())[0]["DSMOE_RASTERIZER"] == flavour
+    make(tmp_path, {GR: renderer.replace("bg=1", "bg=1, f_count=1")})
+    with pytest.raises(patches.PatchError, match="Settings have f_count, which come only with the results"):
+        run.prepare([sys.executable, "train.py"], "smoe", None, environment())
+
+
+IN_FUNCTION = ("def render_{2}():\n    from {0} import GaussianRasterizationSettings as Settings, GaussianRasterizer\n"
+               "    rasterizer = GaussianRasterizer(Settings(bg=1, {3}))\n    {1} = rasterizer(means3D=1)\n")
+
+
+def test_each_package_is_told_by_its_own_calls(tmp_path, monkeypatch):
+    """Classes of the file's own are no rasterizer's, and one that is unknown is kept away where another is there."""
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    known = (IN_FUNCTION.format("diff_gaussian_rasterization_abs", "image, radii, depth_image", 1, "antialiasing=1")
+             + IN_FUNCTION.format("diff_gaussian_rasterization", "image, radii", 2, "")
+             + "class Plain: pass\ndef render_3():\n    rasterizer = Plain(1)\n    a, b = rasterizer(means3D=1)\n"
+             + "def render_4():\n    rasterizer = Missing(1)\n    a, b, c = rasterizer(means3D=1, own=2)\n")
+    monkeypatch.chdir(make(tmp_path, {GR: known}))
+    made, lines = run.prepare(*words)
+    assert made["DSMOE_RUN_PACKAGES"].split(os.pathsep) == [
+        "diff_gaussian_rasterization=inria", "diff_gaussian_rasterization_abs=inria_2024"]
+    assert "diff_gaussian_rasterization_abs will be inria_2024 of this package" in lines[0]
+    unknown = IN_FUNCTION.format("diff_gauss_mask", "image, radii, pieces", 5, "")
+    make(tmp_path, {GR: known + unknown})
+    with pytest.raises(patches.PatchError, match="diff_gauss_mask: its rasterizer returns 3 results"):
+        run.prepare(*words)  # no package is always imported
+    make(tmp_path, {GR: RENAMED.format("diff_gaussian_rasterization", "image, radii") + unknown
+                    + "try:\n    from diff_surfel_rasterization import GaussianRasterizer as S\nexcept E: pass\n"})
+    made, lines = run.prepare(*words)
+    assert made["DSMOE_RUN_PACKAGES"].split(os.pathsep) == [
+        "diff_gaussian_rasterization=inria", "diff_gauss_mask=", "diff_surfel_rasterization="]
+    assert [line.split()[1] for line in lines if "computes something else: an import of it fails" in line] == [
+        "diff_gauss_mask", "diff_surfel_rasterization"]
+    run.write_rasterizers(tmp_path / "packages", made["DSMOE_RUN_PACKAGES"])
+    with pytest.raises(ImportError, match="diff_gauss_mask computes something else; this package cannot stand in"):
+        exec((tmp_path / "packages/diff_gauss_mask/__init__.py").read_text())
+    refused(tmp_path, "it imports diff_gauss_mask, diff_surfel_rasterization too, another rasterizer, which no patch")
+
+
 RENAMED = ("from {0} import GaussianRasterizationSettings as Settings, GaussianRasterizer as Draw\n"
            "draw = Draw(raster_settings=Settings(bg=1))\n{1} = draw(means3D=1)\n")
 
@@ -219,7 +277,11 @@ RENAMED = ("from {0} import GaussianRasterizationSettings as Settings, GaussianR
     ("diff_gauss_own", "rendered_depth, opacity, render, radii", "depth,alpha,color,radii"),
     ("diff_gaussian_rasterization", "inv_depth, image, radii", "inverse_depth,color,radii"),
     ("diff_gaussian_rasterization_w_depth", "out", "what a call returns is not seen"),
-    ("diff_gauss", "image, depth, normal, alpha, radii, extra", "returns 6 results"),
+    ("diff_gauss", "image, depth, normal, alpha, radii, extra", "what normal, extra are, no name or argument says"),
+    ("diff_gaussian_rasterization", "depth, image, radii, is_used", "depth,color,radii,is_used"),
+    ("diff_gaussian_rasterization", "image, radii, depth_normal", "what depth_normal is, no name"),
+    ("diff_gaussian_rasterization", "image, radii, accum_max_count", "what accum_max_count is, no name"),
+    ("diff_gaussian_rasterization", "radii, depth", "a name comes twice, or color or radii are not"),
     ("diff_gaussian_rasterization", "depth, depth_2, image, radii", "returns 4 results"),
     ("diff_gaussian_rasterization_panorama", "image, radii", "another rasterizer, which would render"),
     ("triangle_rasterizer", "image, radii", "another rasterizer, which would render")])
@@ -231,7 +293,8 @@ def test_another_name_or_order_is_told_by_what_callers_show(name, results, flavo
             run.prepare(*words)
         return
     made, lines = run.prepare(*words)
-    assert made["DSMOE_RASTERIZER"] == flavour and f"{name} will be {flavour} of this package" in lines[0]
+    assert made["DSMOE_RUN_PACKAGES"] == f"{name}={flavour}"
+    assert f"{name} will be {flavour} of this package" in lines[0]
     is_renamed, is_ordered = name != "diff_gaussian_rasterization", "," in flavour
     assert [word in "".join(lines) for word in ("is taken for", "the results are told")] == [is_renamed, is_ordered]
     refused(tmp_path, "for which there is no patch: type `dsmoe run" if is_renamed or is_ordered else "unpatchable")

@@ -193,10 +193,10 @@ def test_a_fork_that_no_contract_fits_is_patched_with_a_warning_and_one_of_anoth
     refused(make(tmp_path / "private", {GR: private}), "it imports diff_gaussian_rasterization._C.kmeans_cuda, which")
     both = RENDERER + "\n\ndef render_imp():\n    from diff_gaussian_rasterization_gof import GaussianRasterizer\n"
     beside = {"gaussian_renderer/b.py": both, "train.py": "from gaussian_renderer import b\n" + TRAIN}
-    refused(make(tmp_path / "beside", beside), "it imports diff_gaussian_rasterization_gof, another rasterizer",
-            "an import of diff_smoe_rasterization.integrations in its code can")
+    refused(make(tmp_path / "beside", beside), "it imports diff_gaussian_rasterization_gof too, another rasterizer",
+            "type `dsmoe run --blend-mode smoe -- python train.py ...`")
     for trainer in (None, "3dgs-2023"):  # one beside Inria's, as in gaussian-opacity-fields
-        refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_gof, another rasterizer",
+        refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_gof too, another",
                 trainer=trainer)
 
 
