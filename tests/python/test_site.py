@@ -177,7 +177,7 @@ def test_the_page_of_settings_has_every_variable():
         for path in [ROOT / name] if (ROOT / name).is_file() else (ROOT / name).rglob("*"):
             if path.suffix in (".py", ".cpp", ".yaml") or not path.suffix and path.is_file():
                 text = path.read_text(encoding="utf-8", errors="replace")
-                read.update(re.findall(r'(?:getenv\(|environ\.get\(|environ\[|VARIABLE = |RENAMED = |DEMO = |'
+                read.update(re.findall(r'(?:getenv\(|environ\.get\(|environ\[|VARIABLE = |DEMO = |'
                                        r'"(?:vgg|alex)": )"(DSMOE_\w+)"', text))
                 read.update(re.findall(r"\$\{?(DSMOE_\w+)", text) if path.suffix in ("", ".sh", ".yaml") else ())
     said = {name for names, *_ in settings_tables()["The environment"] for name in names if name.startswith("DSMOE_")}
