@@ -39,8 +39,8 @@ def check_video(path: str) -> None:
         try:
             import imageio_ffmpeg  # noqa: F401
         except ImportError as error:
-            raise TrainerError(f"{path}: for .mp4 imageio-ffmpeg is needed: {pip_install('imageio-ffmpeg')}; .gif and "
-                               "a folder of PNGs need nothing") from error
+            raise TrainerError(f"{path}: for .mp4 imageio-ffmpeg is needed: {pip_install('imageio-ffmpeg')}; .gif, "
+                               ".webp and a folder of PNGs need nothing") from error
 
 
 def write_video(path: str, images: Iterable[Image.Image], fps: float, overwrite: bool = False) -> None:
