@@ -1,5 +1,5 @@
-// The trainers' ops as torch calls them, once for all backends. training_schema.cpp has their signatures. A backend
-// registers `adam<Backend>` and the others under its dispatch key. training_ops_cpu.cpp and training_ops_cuda.cpp
+// The trainers' ops as torch calls them, once for all backends. schema.cpp has their signatures. A backend
+// registers `adam<Backend>` and the others under its dispatch key. ops_cpu.cpp and ops_cuda.cpp
 // define the Backends.
 #pragma once
 
