@@ -104,9 +104,11 @@ def _rendered(names: Sequence[str], settings: Settings, inputs: Dict[str, Any]) 
         rendering, splats = rasterize_with_splats(settings=settings, outputs=outputs, **inputs)
     if mapped:
         maps = splats.gate_map()
-        largest = maps.gaussians[maps.gaussians >= 0]
-        found["largest"] = torch.bincount(largest, minlength=rendering.radii.numel()).to(rendering.color)
-        found["median_depth"] = _median_depth(settings, inputs, maps)
+        if "largest" in names:  # the host waits for it
+            largest = maps.gaussians[maps.gaussians >= 0]
+            found["largest"] = torch.bincount(largest, minlength=rendering.radii.numel()).to(rendering.color)
+        if "median_depth" in names:
+            found["median_depth"] = _median_depth(settings, inputs, maps)
     if counted:
         sums = splats.contributions(torch.ones_like(rendering.color[0]))
         found.update(pixels=sums.pixels.to(rendering.color.dtype)[:, None], weights=sums.blend_weights,
@@ -148,7 +150,7 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
     if own.get("depth_threshold") and points is not None:
         depths = (inputs["means3D"] @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]).detach()
         factors = (depths / own["depth_threshold"]).square().clamp(max=1)
-        inputs.update({name: scaled_gradients(factors, {"": inputs[name]})[""] for name in ("means2D", "means2D_abs")
+        inputs.update({name: scaled_gradient(factors, inputs[name]) for name in ("means2D", "means2D_abs")
                        if name in inputs})
     theta, rho = inputs.pop("theta", None), inputs.pop("rho", None)
     if theta is not None or rho is not None:
@@ -204,16 +206,13 @@ def with_absolute(columns: int, inputs: Dict[str, Any]) -> Dict[str, Any]:
     return {**inputs, "means2D": pad(points[:, :2], (0, 1)), "means2D_abs": points[:, 2:2 + columns].expand(-1, 2)}
 
 
-def scaled_gradients(confidence: torch.Tensor, tensors: Dict[str, Any]) -> Dict[str, Any]:
-    """Returns the tensors of N Gaussians, whose gradients will be multiplied by the confidence [N, 1] or [N]."""
-    def scaled(tensor: Any) -> Any:
-        if tensor is None or tensor.numel() == 0 or not tensor.requires_grad:
-            return tensor
-        tensor = tensor.view_as(tensor)
-        tensor.register_hook(lambda grad: grad * confidence.reshape(-1, *[1] * (grad.dim() - 1)))
+def scaled_gradient(factors: torch.Tensor, tensor: Any) -> Any:
+    """Returns a tensor of N Gaussians, or None, whose gradient will be multiplied by the factors [N, 1] or [N]."""
+    if tensor is None or tensor.numel() == 0 or not tensor.requires_grad:
         return tensor
-
-    return {name: tensor if name == "means2D" else scaled(tensor) for name, tensor in tensors.items()}
+    tensor = tensor.view_as(tensor)
+    tensor.register_hook(lambda grad: grad * factors.reshape(-1, *[1] * (grad.dim() - 1)))
+    return tensor
 
 
 @torch.no_grad()
@@ -254,7 +253,9 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
             inputs["means2D"] = densify if inputs["means2D"] is None else inputs["means2D"] + densify
         confidence = getattr(settings, "confidence", None)
         inputs = with_absolute(2 if getattr(settings, "kernel_size", None) is None else 1, inputs)
-        inputs = inputs if confidence is None else scaled_gradients(confidence, inputs)
+        if confidence is not None:
+            inputs = {name: tensor if name == "means2D" else scaled_gradient(confidence, tensor)
+                      for name, tensor in inputs.items()}
         return renderer(settings, inputs) if renderer else results_of(entry.results, settings, inputs)
 
     def rasterize_gaussians(*values: Any, **named: Any) -> Tuple[torch.Tensor, ...]:

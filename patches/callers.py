@@ -202,9 +202,9 @@ def of_package(facts: Set[str], package: str, kinds: Sequence[str]) -> Set[str]:
     kinds: the beginnings of facts that are about one rasterizer.
     """
     own = {fact.partition(": ")[2] for fact in facts if fact.startswith((f"of {package}: ", "of : "))}
-    packages = {f"{kind} {name}" for kind in (THEIRS, RENAMED) for name in _names(facts, kind) - {package}}
+    packages = {f"{kind} {name}" for kind in (THEIRS, RENAMED) for name in those(facts, kind + " ") - {package}}
     return {fact for fact in facts - packages if not fact.startswith(("of ", *kinds))} | own
 
 
-def _names(facts: Set[str], kind: str) -> Set[str]:
-    return {fact[len(kind) + 1:] for fact in facts if fact.startswith(kind + " ")}
+def those(facts: Set[str], kind: str) -> Set[str]:
+    return {fact[len(kind):] for fact in facts if fact.startswith(kind)}

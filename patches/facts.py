@@ -24,7 +24,7 @@ from diff_smoe_rasterization.integrations.contracts import (
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
 from . import callers
-from .callers import MODULES, OF_GSPLAT, OTHER, OURS, RENAMED, THEIRS
+from .callers import MODULES, OF_GSPLAT, OTHER, OURS, RENAMED, THEIRS, those
 from .source import PatchError, tree_of
 from .trainers import GR, INTEGRATIONS, TRAINERS, Trainer
 
@@ -341,10 +341,6 @@ def _meaning(name: str, facts: Set[str]) -> str:
         return said
     others = [result for result in given if result != "normal"]
     return others[0] if said != "normal" and len(others) == 1 else ""
-
-
-def those(facts: Set[str], kind: str) -> Set[str]:
-    return {fact[len(kind):] for fact in facts if fact.startswith(kind)}
 
 
 def _known(contract: Contract) -> Set[str]:

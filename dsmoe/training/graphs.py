@@ -28,7 +28,7 @@ WARM_UP = 64  # steps without a graph, from which the room for the lists of tile
 MOST_KINDS = 4  # that are captured at a time; of cameras that all differ each would be seen too seldom
 FULL = 0.8  # a graph whose lists are filled more than this is captured anew: what they do not hold would take long
 SPARE_ROOM = 1.25  # memory of graphs is for so many times the Gaussians: a densification then needs no other memory
-PIXEL_BYTES = 100  # of that memory, about
+PIXEL_BYTES = 100  # of memory, about, for an image that is rendered and differentiated
 
 MATRICES = ("viewmatrix", "projmatrix", "campos")
 PLANES = ("image", "opacity", "mask")

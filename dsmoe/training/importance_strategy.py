@@ -131,7 +131,7 @@ class ImportanceStrategy(SteadyStrategy):
             self.move()
         behind, between = step.iteration - self.average_begins, self.between_terms
         if self.average_span > 0 and behind // between > max(0, behind - step.batch) // between:
-            # At first all terms weigh the same, as else the first one would weigh more than others to the end.
+            # At first all terms weigh about the same, as else the first one would weigh more than others to the end.
             part = min(1.0, max(between, step.batch) / min(self.average_span, behind))
             gate = self.context.render.background_gate
             self.context.optimizer.add_to_average(part, gate if isinstance(gate, torch.Tensor) else None)

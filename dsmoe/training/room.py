@@ -4,6 +4,7 @@ from __future__ import annotations
 import torch
 
 from ..config import TrainConfig
+from .graphs import PIXEL_BYTES
 
 # Numbers of memory that a Gaussian takes at the peak: for each of its parameters that one, its gradient, two moments of
 # Adam, and what a densification copies. Others are activations, places on the image, statistics and tile lists. By
@@ -14,7 +15,6 @@ FOR_EACH_PARAMETER, OTHERS = 5, 65
 # without a densification.
 FOR_EACH_PARAMETER_OF_A_BATCH, OF_A_FURTHER_VIEW = 1, 10
 PARAMETERS_BESIDE_COLOR = 11  # mean, opacity, scales, rotation
-PIXEL_BYTES = 100  # about, of an image that is rendered and differentiated
 
 
 def gaussian_bytes(config: TrainConfig) -> int:
