@@ -80,9 +80,9 @@ def render_targets(trainer: BatchTrainer) -> None:
         settings = trainer.renderer.settings_of(view.camera)
         batch = Batch(trainer.group, trainer.model, [settings])
         image = torch.zeros_like(view.image)
-        if batch.own_views:
-            color = batch.draw(0, settings, for_backward=False).color
-            image = ((0.9 * color + 0.1).clamp(0, 1) * 255).to(torch.uint8)
+        drawn = batch.draw(0, for_backward=False)
+        if drawn:
+            image = ((0.9 * drawn[1].color + 0.1).clamp(0, 1) * 255).to(torch.uint8)
         if trainer.group.size > 1:
             torch.distributed.broadcast(image, 0)
         views[index] = View(view.camera, image)

@@ -156,6 +156,42 @@ template <class Frame> void refuse_radii(const char* function, const Frame& fram
   refuse_null(function, "images.radii", frame.images.radii, "[N]", frame.inputs.num_gaussians);
 }
 
+// A batch of views that is not as its struct says. Frame: that of the backend. What a stage reads and writes of the
+// views: refuse(view).
+template <class Frame, class Batch, class Refuse>
+void refuse_batch(const char* function, const Batch& batch, const Refuse& refuse_view) {
+  const int64_t count = static_cast<int64_t>(batch.views.size());
+  if (count < 1 || count > kMostViews) refuse(function, "views has length ", count, "; it must be 1 to ", kMostViews);
+  if (batch.config.num_features() != 3) refuse(function, "config asks for depths; rows have colours alone");
+  Frame frame;
+  frame.inputs = batch.inputs, frame.config = batch.config;
+  for (const auto& view : batch.views) {
+    frame.camera = view.camera;
+    refuse_projection(function, frame);
+    refuse_null(function, "radii", view.radii, "[N]", batch.inputs.num_gaussians);
+    refuse_null(function, "offsets", view.offsets, "[num_view_blocks(N) + 1]", 1);
+    refuse_view(view);
+  }
+  if (batch.inputs.num_gaussians == 0) return;
+  if (batch.inputs.cov3D_precomp != nullptr)
+    refuse(function, "cov3D_precomp is given; rows are of scales and rotations");
+  if (batch.inputs.colors_precomp != nullptr) refuse(function, "colors_precomp is given; rows are of shs or dc");
+  if (batch.inputs.shs != nullptr && batch.inputs.num_sh > kMaxShCoefficients) {
+    refuse(function, "shs has ", batch.inputs.num_sh, " coefficients a Gaussian; rows are of at most ",
+           kMaxShCoefficients);
+  }
+}
+
+// The same for a stage that reads or writes rows.
+template <class Frame, class Batch> void refuse_rows(const char* function, const Batch& batch, bool backward) {
+  refuse_batch<Frame>(function, batch, [&](const auto& view) {
+    if (view.num_rows < 0) refuse(function, "num_rows is ", view.num_rows, "; it must be 0 or more");
+    if (!backward) refuse_null(function, "gates", view.gates, "[M, 8]", view.num_rows);
+    refuse_null(function, "features", view.features, "[M, 4]", view.num_rows);
+    if (backward) refuse_null(function, "records", view.records, "[M, 9]", view.num_rows);
+  });
+}
+
 template <class Frame> void refuse_images(const char* function, const Frame& frame) {
   const auto& images = frame.images;
   refuse_null(function, "background", frame.config.background, "[C]", 1);

@@ -6,31 +6,22 @@ by itself does the same without sending.
 """
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Callable, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
 from diff_smoe_rasterization.autograd import INPUTS
-from diff_smoe_rasterization.footprints import GATE_GRADIENTS, Footprints, blend_op_arguments, projection_arguments
+from diff_smoe_rasterization.footprints import GATE_GRADIENTS, Footprints, blend_op_arguments
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 from diff_smoe_rasterization.splats import Splats
 
 from ..model import PARAMETERS, GaussianModel
 from ..system.group import Group
 from ..training.strategy import Look
+from .rows import ViewRows
 
 _OPS = torch.ops.diff_smoe_rasterization
-_GATE = 8  # numbers of a footprint before its features
-
-
-class Projected(NamedTuple):
-    """The own Gaussians on the image of one view, as the backward pass needs them."""
-
-    inputs: Sequence[Optional[torch.Tensor]]  # of the op `project`
-    options: Sequence[Any]  # likewise
-    visible: torch.Tensor  # [M] int64
-    features: torch.Tensor  # [N, F]
-    radii: torch.Tensor  # [N] int32
+_RECORD = GATE_GRADIENTS + 3  # numbers: gradients by a row
 
 
 class DrawnImage:
@@ -60,120 +51,95 @@ class DrawnImage:
 
 
 class Batch:
-    """The views of one step, from projection to gradients. View k is blended by process k of the group, in turns."""
+    """The views of one step, from projection to gradients.
+
+    They are blended in rounds, in each of which a process has at most one view. What the next rounds need is sent
+    meanwhile, and so is what the rounds before have found. A process's part of all Gaussians is a run of their order,
+    so that the rows of a view, process by process, are in that order too.
+    """
 
     def __init__(self, group: Group, model: GaussianModel, settings: Sequence[GaussianRasterizationSettings],
                  note: int = 0) -> None:
-        """Projects and sends. settings: of each view. note: a number; `notes` has those of all processes."""
-        self.group, self.model = group, model
-        self.owners = [view % group.size for view in range(len(settings))]
-        self.own_views = [view for view, owner in enumerate(self.owners) if owner == group.rank]
-        # Order of the views in the send buffer: grouped by receiver.
-        self._order = sorted(range(len(settings)), key=lambda view: self.owners[view])
+        """Projects, and begins to send. settings: of each view. note: a number; `notes` has those of all processes."""
+        self.group, self.model, self.settings = group, model, settings
         self._values = model.activated()
         opacities, scales, rotations = self._values
-        arguments = {**model.color_arguments(), "scales": scales, "rotations": rotations,
-                     "means2D": model.raw["means3D"]}  # only its gradient is used
-        self.projected: List[Projected] = []
-        packed: List[torch.Tensor] = []
-        for each in settings:
-            inputs, options = projection_arguments(each, model.raw["means3D"], opacities, **arguments)
-            gates, features, radii = _OPS.project(*inputs, *options, True)
-            visible = radii.nonzero().squeeze(1)
-            self.projected.append(Projected(inputs, (*options, True), visible, features, radii))
-            packed.append(_OPS.pack_footprints(gates, features, radii, visible))
-        *rows, notes = zip(*group.gather_numbers([*map(len, packed), note], str(radii.device)))
+        self._rows = ViewRows(settings, model.raw["means3D"], opacities, scales=scales, rotations=rotations,
+                              **model.color_arguments())
+        self.radii = self._rows.radii
+        own = self._rows.counts
+        gathered = group.gather_numbers(torch.cat([own, own.new_full((1,), note)]), str(own.device))
+        *counts, notes = zip(*gathered)
         self.notes = list(notes)
-        self._counts: List[Sequence[int]] = rows  # [view][process] how many footprints
-        if group.size == 1:
-            self._arrived = {view: [rows] for view, rows in enumerate(packed)}
-        else:
-            outgoing = joined([packed[view] for view in self._order])
-            self._arrived = self._split(group.exchange(outgoing, *self._lengths(self._order)))
+        self._counts: List[Sequence[int]] = counts  # [view][process] how many rows
+        self.rounds = rounds_of([sum(of_view) for of_view in counts], group.size)
+        self.own_views = [views[group.rank] for views in self.rounds if group.rank in views]
+        order = [view for views in self.rounds for _, view in sorted(views.items())]
+        tensors = self._rows.project([of_view[group.rank] for of_view in counts], order)
+        lengths = [sum(self._sent(views)) for views in self.rounds]
+        self._arriving = [[group.begin_exchange(part, self._sent(views), self._received(views)) for part in parts]
+                          for views, *parts in zip(self.rounds, *(tensor.split(lengths) for tensor in tensors))]
+        self._returning: Dict[int, Callable[[], torch.Tensor]] = {}  # by round
 
-    def _lengths(self, views: Sequence[int]) -> Tuple[List[int], List[int]]:
-        """How many rows of footprints of these views go to each process, and how many come from each."""
-        group = self.group
-        sent = [sum(self._counts[view][group.rank] for view in views if self.owners[view] == rank)
-                for rank in range(group.size)]
-        received = [sum(self._counts[view][rank] for view in views if view in self.own_views)
-                    for rank in range(group.size)]
-        return sent, received
+    def _sent(self, views: Dict[int, int]) -> List[int]:
+        """How many own rows of a round go to each process."""
+        return [self._counts[views[rank]][self.group.rank] if rank in views else 0 for rank in range(self.group.size)]
 
-    def _split(self, rows: torch.Tensor) -> Dict[int, List[torch.Tensor]]:
-        """What came, by own view the rows of each process in their order: that of all Gaussians."""
-        parts = iter(rows.split([self._counts[view][rank] for rank in range(self.group.size)
-                                 for view in self.own_views]))
-        by_rank = [{view: next(parts) for view in self.own_views} for _ in range(self.group.size)]
-        return {view: [of_rank[view] for of_rank in by_rank] for view in self.own_views}
+    def _received(self, views: Dict[int, int]) -> List[int]:
+        """How many rows come from each process for the own view of a round."""
+        rank = self.group.rank
+        return list(self._counts[views[rank]]) if rank in views else [0] * self.group.size
 
-    def draw(self, view: int, settings: GaussianRasterizationSettings, for_backward: bool = True) -> DrawnImage:
-        """Blends one of the own views, once."""
-        rows = joined(self._arrived.pop(view))
-        radii = rows[:, -1].contiguous().view(torch.int32)
-        return DrawnImage(Footprints(rows[:, :_GATE], rows[:, _GATE:-1], radii), settings, for_backward)
+    def draw(self, index: int, for_backward: bool = True) -> Optional[Tuple[int, DrawnImage]]:
+        """Blends the own view of a round. Call it once for each round, in their order. Returns None without a view."""
+        gates, features = (end() for end in self._arriving[index])
+        self._arriving[index] = []
+        view = self.rounds[index].get(self.group.rank)
+        if view is None:
+            return None
+        radii = features.view(torch.int32)[:, -1].contiguous()
+        return view, DrawnImage(Footprints(gates, features, radii), self.settings[view], for_backward)
 
-    def give_back(self, records: Dict[int, torch.Tensor]) -> List[torch.Tensor]:
-        """From the gradients by the footprints of each own view to those by the own footprints of each view.
+    def send_back(self, index: int, records: Optional[torch.Tensor]) -> None:
+        """Begins to return gradients by the rows of the own view of a round; None without a view."""
+        self._returning[index] = self._begin_return(self.rounds[index], records, _RECORD)
 
-        The records are taken out of `records`.
-        """
-        width = GATE_GRADIENTS + self.projected[0].features.shape[1]
-        return self._return(records, range(len(self.owners)), width)
+    def _begin_return(self, views: Dict[int, int], rows: Optional[torch.Tensor], width: int
+                      ) -> Callable[[], torch.Tensor]:
+        if rows is None:
+            rows = self._values[0].new_empty((0, width))
+        return self.group.begin_exchange(rows, self._received(views), self._sent(views))
 
-    def looks(self, own: Dict[int, Look], views: Sequence[int]) -> List[Look]:
-        """From looks at own views, at their footprints, to looks at these views, at the own Gaussians."""
-        rows = {view: torch.stack(look, 1) for view, look in own.items()}
-        looks: List[Look] = []
-        for view, part in zip(views, self._return(rows, views, len(Look._fields))):
-            projected = self.projected[view]
-            dense = part.new_zeros((len(projected.radii), part.shape[1]))
-            dense.index_copy_(0, projected.visible, part)
-            looks.append(Look(*dense.unbind(1)))
-        return looks
+    def _by_view(self, views: Dict[int, int], rows: torch.Tensor) -> Dict[int, torch.Tensor]:
+        """What has returned of a round, for the own rows of each view."""
+        parts = rows.split(self._sent(views))
+        return {view: parts[rank] for rank, view in views.items()}
 
-    def _return(self, rows: Dict[int, torch.Tensor], views: Sequence[int], width: int) -> List[torch.Tensor]:
-        """From rows [M, width] for the footprints of each own view to rows for the own footprints of these views.
+    def looks(self, own: Dict[int, Look], wanted: Sequence[int]) -> List[Look]:
+        """From looks at own views, at their footprints, to looks at the wanted views, at the own Gaussians."""
+        found: Dict[int, Look] = {}
+        for views in self.rounds:
+            some = {rank: view for rank, view in views.items() if view in wanted}
+            look = own.get(some[self.group.rank]) if self.group.rank in some else None
+            rows = None if look is None else torch.stack(look, 1)
+            returned = self._begin_return(some, rows, len(Look._fields))()
+            for view, part in self._by_view(some, returned).items():
+                radii = self.radii[view]
+                dense = part.new_zeros((len(radii), part.shape[1]))
+                dense.index_copy_(0, radii.nonzero().squeeze(1), part)
+                found[view] = Look(*dense.unbind(1))
+        return [found[view] for view in wanted]
 
-        views: the same in all processes, rising. The rows are taken out of `rows`.
-        """
-        if self.group.size == 1:
-            return [rows.pop(view) for view in views]
-        own = [view for view in self.own_views if view in views]
-        by_view = {view: rows.pop(view).split(list(self._counts[view])) for view in own}
-        parts = [by_view[view][rank] for rank in range(self.group.size) for view in own]
-        order = [view for view in self._order if view in views]
-        sent, received = self._lengths(order)
-        outgoing = joined(parts) if parts else self.projected[0].features.new_empty((0, width))
-        del by_view, parts
-        returned = self.group.exchange(outgoing, received, sent)
-        pieces = returned.split([self._counts[view][self.group.rank] for view in order])
-        return [piece for _, piece in sorted(zip(order, pieces), key=lambda pair: pair[0])]
-
-    def backward(self, records: List[torch.Tensor]) -> List[torch.Tensor]:
+    def backward(self) -> List[torch.Tensor]:
         """Sets the gradients of the model's parameters, sums over the views in their order.
 
-        records: what `give_back` returned; it is emptied. Returns for each view dL/dpixel times (W / 2, H / 2), [N, 3].
+        Returns for each view dL/dpixel times (W / 2, H / 2), [N, 3], written where the radius is above 0.
         """
-        present = [tensor is not None for tensor in self.projected[0].inputs]
-        names, wanted = gradient_places(present)
-        sums: Optional[List[torch.Tensor]] = None
-        means2D: List[torch.Tensor] = []
-        for projected in self.projected:
-            rows = records.pop(0)
-            dense = rows.new_zeros((len(projected.radii), rows.shape[1]))
-            dense.index_copy_(0, projected.visible, rows)
-            given = [tensor for tensor in projected.inputs if tensor is not None]
-            gradients = _OPS.project_backward(dense, None, given, present, projected.features, projected.radii,
-                                              *projected.options, wanted)
-            means2D.append(gradients.pop(names.index("means2D")))
-            if sums is None:
-                sums = gradients
-            else:
-                torch._foreach_add_(sums, gradients)
-            del rows, dense, gradients  # they are as large as the parameters
-        names.remove("means2D")
-        self._set_gradients(dict(zip(names, sums or ())))
+        records: Dict[int, torch.Tensor] = {}
+        for index, views in enumerate(self.rounds):
+            records.update(self._by_view(views, self._returning.pop(index)()))
+        gradients, means2D = self._rows.backward([records[view] for view in range(len(records))])
+        self._set_gradients(gradients)
         return means2D
 
     def _set_gradients(self, by_input: Dict[str, torch.Tensor]) -> None:
@@ -190,13 +156,17 @@ class Batch:
             raw[name].grad = by_name.get(name)
 
 
-def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """All rows of the parts, copied only if there are several parts."""
-    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+def rounds_of(sizes: Sequence[int], processes: int) -> List[Dict[int, int]]:
+    """Who blends which view, by round: in each round a view for each process, by its rank.
 
-
-def gradient_places(present: Sequence[bool]) -> Tuple[List[str], List[bool]]:
-    """The inputs of the op `project` whose gradients a step wants: their names, and which of all they are."""
-    wanted = [here and name in ("means3D", "means2D", "opacities", "dc", "shs", "scales", "rotations")
-              for name, here in zip(INPUTS, present)]
-    return [name for name, want in zip(INPUTS, wanted) if want], wanted
+    sizes: of the views. The larger ones come first, and who has had a larger one takes a smaller one, so that nobody
+    waits long for the others. A single round has the views in their order.
+    """
+    order = list(range(len(sizes)))
+    if len(sizes) > processes:
+        order.sort(key=lambda view: -sizes[view])
+    rounds = []
+    for begin in range(0, len(order), processes):
+        ranks = range(processes) if len(rounds) % 2 == 0 else range(processes - 1, -1, -1)
+        rounds.append(dict(zip(ranks, order[begin:begin + processes])))
+    return rounds

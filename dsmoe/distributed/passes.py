@@ -33,21 +33,24 @@ class BatchPasses(Passes):
         self.asked = any(batch.notes)
         # Losses, and gradients by the background's gate.
         numbers = torch.zeros(2, len(views), device=self.model.raw["means3D"].device)
-        self._records: Dict[int, torch.Tensor] = {}
         looks: Dict[int, Look] = {}
 
-        def blend(view: int) -> None:  # what one view has saved is gone before the next one is blended
-            drawn = batch.draw(view, settings[view])
-            target, loss, gradient = compare(views[view], drawn.color)
+        def blend(index: int) -> Optional[torch.Tensor]:  # what a view has saved is gone before the next one is blended
+            drawn = batch.draw(index)
+            if drawn is None:
+                return None
+            view, image = drawn
+            target, loss, gradient = compare(views[view], image.color)
             if view in looked:
-                looks[view] = look_at(views[view].view, target, drawn.color, drawn.splats())
-            self._records[view], dL_dgate = drawn.backward(gradient, self.gate is not None)
+                looks[view] = look_at(views[view].view, target, image.color, image.splats())
+            records, dL_dgate = image.backward(gradient, self.gate is not None)
             numbers[0, view] = loss
             if self.gate:
                 numbers[1, view] = dL_dgate[0]
+            return records
 
-        for view in batch.own_views:
-            blend(view)
+        for index in range(len(batch.rounds)):
+            batch.send_back(index, blend(index))
         self.group.add_up(numbers)
         losses, self._dL_dgates = numbers
         step = Step(iteration, len(views), losses.mean(), self._add_gradient)
@@ -62,17 +65,17 @@ class BatchPasses(Passes):
             settings = [self.renderer.settings_of(view.camera) for view in some]
             batch = Batch(self.group, self.model, settings)
             looks: Dict[int, Look] = {}
-            for index in batch.own_views:
-                drawn = batch.draw(index, settings[index], for_backward=False)
-                looks[index] = look_at(some[index], some[index].image, drawn.color, drawn.splats())
+            drawn = batch.draw(0, for_backward=False)
+            if drawn:
+                view, image = drawn
+                looks[view] = look_at(some[view], some[view].image, image.color, image.splats())
             yield from batch.looks(looks, range(len(some)))
 
     @torch.no_grad()
     def backward(self, step: Step) -> None:
         batch, self._batch = self._batch, None  # it holds on to memory
         assert batch is not None, "render comes first"
-        means2D = batch.backward(batch.give_back(self._records))
-        step.seen += [(gradients, projected.radii) for gradients, projected in zip(means2D, batch.projected)]
+        step.seen += zip(batch.backward(), batch.radii)
         if self.gate:
             self.gate.gradient.copy_(sum(self._dL_dgates.unbind(), torch.zeros_like(step.loss)))
 

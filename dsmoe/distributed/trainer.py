@@ -53,8 +53,8 @@ class BatchTrainer(Trainer):
 
         def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:
             settings = [shown.settings_of(view.camera) for view in some]
-            batch = Batch(group, shown.model, settings)
-            return {view: batch.draw(view, settings[view], for_backward=False).color for view in batch.own_views}
+            drawn = Batch(group, shown.model, settings).draw(0, for_backward=False)
+            return {drawn[0]: drawn[1].color} if drawn else {}
 
         def longest(seconds: float) -> float:  # all processes decide alike
             return max(group.gather_numbers([round(1000 * seconds)], device))[0] / 1000

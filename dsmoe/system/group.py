@@ -8,7 +8,7 @@ import re
 import sys
 import threading
 import time
-from typing import List, Optional, Sequence
+from typing import Callable, List, Optional, Sequence, Union
 
 import torch
 import torch.distributed
@@ -36,13 +36,21 @@ class Group:
         """Whether this process prints, evaluates and writes."""
         return self.rank == 0
 
-    def gather_numbers(self, numbers: Sequence[int], device: str) -> List[List[int]]:
-        """The numbers, equally many, of every process. The host waits for its device."""
-        return [list(numbers)]
+    def gather_numbers(self, numbers: Union[Sequence[int], torch.Tensor], device: str) -> List[List[int]]:
+        """The numbers, equally many, of every process. The host waits for its device.
+
+        A tensor is int64, and on the device.
+        """
+        return [numbers.tolist() if isinstance(numbers, torch.Tensor) else list(numbers)]
 
     def exchange(self, rows: torch.Tensor, sent: Sequence[int], received: Sequence[int]) -> torch.Tensor:
         """Sends rows [sum(sent), ...] to the processes in rank order; returns the rows received, in the same order."""
-        return rows
+        return self.begin_exchange(rows, sent, received)()
+
+    def begin_exchange(self, rows: torch.Tensor, sent: Sequence[int], received: Sequence[int]
+                       ) -> Callable[[], torch.Tensor]:
+        """Begins an exchange, beside what the device does meanwhile. Returns what ends it, to be called once."""
+        return lambda: rows
 
     def all_rows(self, rows: torch.Tensor, counts: Sequence[int]) -> torch.Tensor:
         """The rows of all processes, in their order. counts: how many each has."""
@@ -81,16 +89,23 @@ class DistributedGroup(Group):
                 timeout=datetime.timedelta(seconds=30))
             self.closing.enter_context(Heartbeat(store, self.rank, self.size))
 
-    def gather_numbers(self, numbers: Sequence[int], device: str) -> List[List[int]]:
-        own = torch.tensor(list(numbers), dtype=torch.int64, device=device)
+    def gather_numbers(self, numbers: Union[Sequence[int], torch.Tensor], device: str) -> List[List[int]]:
+        own = numbers if isinstance(numbers, torch.Tensor) else torch.tensor(
+            list(numbers), dtype=torch.int64, device=device)
         every = own.new_empty((self.size, len(own)))
         torch.distributed.all_gather(list(every.unbind()), own)
         return every.tolist()
 
-    def exchange(self, rows: torch.Tensor, sent: Sequence[int], received: Sequence[int]) -> torch.Tensor:
-        out = rows.new_empty((sum(received), *rows.shape[1:]))
-        torch.distributed.all_to_all_single(out, rows.contiguous(), list(received), list(sent))
-        return out
+    def begin_exchange(self, rows: torch.Tensor, sent: Sequence[int], received: Sequence[int]
+                       ) -> Callable[[], torch.Tensor]:
+        out, dense = rows.new_empty((sum(received), *rows.shape[1:])), rows.contiguous()
+        work = torch.distributed.all_to_all_single(out, dense, list(received), list(sent), async_op=True)
+
+        def end(dense: torch.Tensor = dense) -> torch.Tensor:  # which must live until then
+            work.wait()
+            return out
+
+        return end
 
     def all_rows(self, rows: torch.Tensor, counts: Sequence[int]) -> torch.Tensor:
         out = rows.new_empty((sum(counts), *rows.shape[1:]))

@@ -349,6 +349,10 @@ def every_call():
     image_gradients = {name: value for name, value in backward.items() if name.startswith("dL_d")}
     inputs = {name: backward[name] for name in ("inputs", "present")}
     belongs = [here and name not in ("bg", "background_gate") for name, here in zip(_core.inputs, inputs["present"])]
+    camera = [scene.settings.viewmatrix, scene.settings.projmatrix, scene.settings.campos]
+    view = {"cameras": camera, "images": [20.0, 18.0, 1.0, 1.0], "depth": False, "inverse_depth": False}
+    counted = {"radii": torch.zeros(1, 20, dtype=torch.int32), "offsets": torch.zeros(1, 2, dtype=torch.int32)}
+    wide = torch.zeros(1, 4)
     depth = random_normal((20,), 1, torch.float32)
     raw = [random_normal((20, columns), columns, torch.float32) for columns in (3, 1, 3, 4)]
     values = list(torch.ops.diff_smoe_rasterization.activate(*raw[1:]))
@@ -370,7 +374,8 @@ def every_call():
         "contributions": {"pixel_weights": maps, **kept}, "gate_map": {"gate_sum": images["gate_sum"], **kept},
         "importance": {"pixel_weights": maps, "share_weights": maps, "color": images["color"],
                        "gate_sum": images["gate_sum"], **kept},
-        "pack_footprints": {**footprints, "visible": torch.arange(3)},
+        "count_rows": view, "project_rows": {**view, **counted, "gates": [gates[:1]], "features": [wide]},
+        "project_rows_backward": {**view, **counted, "features": [wide], "records": [wide.new_zeros(1, 9)]},
         "mark_visible": {"positions": scene.inputs["means3D"]},
         "adam": {"parameters": alike(), "gradients": alike(), **adam, "visible": torch.ones(20, dtype=torch.bool)},
         "lazy_adam_catch_up": {"parameters": alike(), "gradients": alike(), **adam, "marks": marks, "rates": rates,

@@ -3,10 +3,21 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import assert_not_empty, gradients, random_scene, random_weights, with_gates, without_tails
+from devices import random_normal
+from scenes import (
+    assert_not_empty,
+    camera_settings,
+    gradients,
+    random_scene,
+    random_weights,
+    with_gates,
+    without_tails,
+)
 
+from diff_smoe_rasterization.arguments import op_arguments
 from diff_smoe_rasterization import Footprints, blend_footprints, project_gaussians, rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
+from dsmoe.distributed.rows import ViewRows
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -66,16 +77,83 @@ def test_footprints_of_shards_are_those_of_the_whole():
     assert torch.equal(actual.color, expected.color) and torch.equal(actual.radii, expected.radii)
 
 
-def test_packed_footprints_are_rows_of_their_numbers():
-    scene = random_scene("smoe", dtype=torch.float32)
-    footprints = project_gaussians(settings=scene.settings, **scene.inputs)
-    visible = footprints.radii.nonzero().squeeze(1)
-    assert 5 < len(visible) < 120
-    rows = torch.ops.diff_smoe_rasterization.pack_footprints(*footprints, visible)
-    seen = footprints.rows(visible)
-    assert rows.shape == (len(visible), 12) and torch.equal(rows[:, :8], seen.gates)
-    assert torch.equal(rows[:, 8:11], seen.features)
-    assert torch.equal(rows[:, 11].contiguous().view(torch.int32), seen.radii)
+@pytest.mark.parametrize("case", [dict(degree=3, split_dc=True), dict(degree=3), dict(degree=1, split_dc=True),
+                                  dict(degree=0), dict(degree=2, antialiasing=True)], ids=str)
+def test_rows_of_a_batch_are_the_footprints_of_its_views(mode, case):
+    """And their gradients are sums over the views. There are more views than the ops take at once."""
+    scene = random_scene(mode, 300, dtype=torch.float32, **case).to(torch.float32)
+    inputs = {name: tensor for name, tensor in scene.inputs.items() if name != "means2D"}
+    broken = next(name for name in ("dc", "shs") if name in inputs)
+    inputs[broken][30] = float("nan")  # its row has radius 0
+    cameras = [camera_settings(20 + view, 19, (0.4, 0.1 * view, -4.0), dtype=torch.float32, degree=case["degree"])
+               for view in range(18)]
+    settings = [scene.settings._replace(**{name: getattr(each, name) for name in (
+        "image_width", "image_height", "tanfovx", "tanfovy", "viewmatrix", "projmatrix", "campos")})
+        for each in cameras]
+    rows = ViewRows(settings, **inputs)
+    counts = rows.counts.tolist()
+    order = list(reversed(range(len(settings))))
+    gates, features = rows.project(counts, order)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+    places = [torch.zeros(300, 3, dtype=torch.float32, requires_grad=True) for _ in settings]
+    records, loss, begin = {}, 0.0, 0
+    for view in order:
+        footprints = project_gaussians(settings=settings[view], means2D=places[view], **leaves)
+        seen = (rows.radii[view] != 0).nonzero().squeeze(1)
+        assert torch.equal(rows.radii[view].clamp(min=0), footprints.radii) and 5 < len(seen) == counts[view] < 300
+        part = slice(begin, begin + counts[view])
+        begin = part.stop
+        there = footprints.radii[seen] > 0
+        assert torch.equal(features[part, 3].contiguous().view(torch.int32), footprints.radii[seen])
+        for actual, expected in ((gates, footprints.gates), (features[:, :3], footprints.features)):
+            torch.testing.assert_close(actual[part][there], expected[seen][there].detach(), rtol=1e-5, atol=1e-5)
+        records[view] = random_normal((counts[view], 9), view, torch.float32)
+        of_gates, of_features = records[view][:, :6] * there[:, None], records[view][:, 6:] * there[:, None]
+        loss = loss + (footprints.gates[seen][:, :6] * of_gates)[there].sum()
+        loss = loss + (footprints.features[seen] * of_features)[there].sum()
+    loss.backward()
+    gradients, means2D = rows.backward([records[view] for view in range(len(settings))])
+    assert set(gradients) == set(inputs)
+    for name, gradient in gradients.items():
+        # Sums of 18 views in another order of operations.
+        expected = leaves[name].grad
+        torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+    for view, (actual, place) in enumerate(zip(means2D, places)):
+        there = rows.radii[view] > 0
+        torch.testing.assert_close(actual[there], place.grad[there], rtol=1e-4, atol=1e-5 * float(place.grad.abs().max()))
+
+
+def test_views_of_a_batch_without_rows_or_gaussians():
+    scene = random_scene("smoe", 140, degree=1, dtype=torch.float32)
+    for inputs in (scene.inputs, scene.rows(slice(0, 0)).inputs):
+        inputs = {name: tensor for name, tensor in inputs.items() if name != "means2D"}
+        behind = scene.settings.viewmatrix.clone()
+        behind[3, 2] = -50
+        rows = ViewRows([scene.settings._replace(viewmatrix=behind)] * 2, **inputs)
+        assert rows.counts.tolist() == [0, 0]
+        gates, features = rows.project([0, 0], [0, 1])
+        assert gates.shape == (0, 8) and features.shape == (0, 4)
+        gradients, _ = rows.backward([gates.new_zeros(0, 9)] * 2)
+        for name, gradient in gradients.items():
+            assert gradient.shape == inputs[name].shape and not gradient.any()
+
+
+@pytest.mark.parametrize("change, message", [
+    (dict(images=[1.0]), "cameras and images have lengths 3 and 1; they must have 3 tensors and 4 numbers a view"),
+    (dict(covariance="cov3D"), "cov3D_precomp is given; rows are of scales and rotations"),
+    (dict(channels=3), "colors_precomp is given; rows are of shs or dc"),
+    (dict(dtype=torch.float64), "means3D is float64; it must be float32"),
+    (dict(depth=True), "config asks for depths; rows have colours alone")])
+def test_rows_refuse_what_they_do_not_hold(change, message):
+    given = {name: change[name] for name in ("covariance", "channels") if name in change}
+    scene = random_scene("smoe", 20, **{"dtype": torch.float32, **given, **{
+        name: change[name] for name in change if name == "dtype"}})
+    arguments, options = op_arguments("project_gaussians", scene.settings, ("depth",) if "depth" in change else (),
+                                      **scene.inputs)
+    camera = [scene.settings.viewmatrix, scene.settings.projmatrix, scene.settings.campos]
+    images = change.get("images", [50.0, 37.0, 1.0, 1.0])
+    with pytest.raises((ValueError, TypeError), match=f"count_rows: {message}"):
+        torch.ops.diff_smoe_rasterization.count_rows(*arguments, *options, True, camera, images)
 
 
 def test_of_equal_depths_the_first_is_in_front():

@@ -177,7 +177,9 @@ void project_backward(const Frame<S>& frame, const FootprintGradients<S>& footpr
   project_all_backward(frame, gradients, times, [&] {
     return [&](int64_t i, PixelSums<S>& sums) {
       if (frame.images.radii[i] == 0) return false;
-      sums = pixel_sums(footprints, i, num_features, frame.saved.features + i * num_features);
+      sums = pixel_sums<S>(footprints.records + i * (kNumGateGradients + num_features),
+                           frame.saved.features + i * num_features);
+      if (footprints.depths != nullptr) sums.depth = footprints.depths[i];
       return true;
     };
   });

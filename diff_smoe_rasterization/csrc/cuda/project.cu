@@ -123,26 +123,6 @@ __global__ void __launch_bounds__(kStoreBlock)
   store_order(arguments.order, i, arguments.radii[i], arguments.projected[i].depth);
 }
 
-// A thread copies one number: neighbours read and write neighbouring ones.
-__global__ void __launch_bounds__(kStoreBlock) pack_footprints_kernel(const __grid_constant__ FootprintRows pack) {
-  const int width = kProjectedGaussianSize + pack.num_features + 1;
-  const int64_t at = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x, row = at / width;
-  const int column = static_cast<int>(at - row * width), feature = column - kProjectedGaussianSize;
-  if (row >= pack.count) return;
-  const int64_t i = pack.gaussians[row];
-  float number = NAN;
-  if (i < 0 || i >= pack.num_gaussians) {
-    // no footprint
-  } else if (feature < 0) {
-    number = pack.projected[i * kProjectedGaussianSize + column];
-  } else if (feature < pack.num_features) {
-    number = pack.features[i * feature_stride(pack.num_features) + feature];
-  } else {
-    number = __int_as_float(pack.radii[i]);
-  }
-  pack.rows[at] = number;
-}
-
 template <class S> struct RadiiArguments {
   GaussianInputs<S> inputs;  // read
   DeviceCamera<S> camera;    // read
@@ -211,13 +191,6 @@ template <class S> void key_footprints(const Frame<S>& frame, DepthBits<S>* dept
   arguments.order = order_targets(frame, depths);
   key_footprints_kernel<<<blocks_for(arguments.num_gaussians, kStoreBlock), kStoreBlock, 0, work.stream>>>(arguments);
   DSMOE_CHECK_LAUNCH("key_footprints");
-}
-
-void pack_footprints(const FootprintRows& pack, const Work& work) {
-  const int64_t numbers = pack.count * (kProjectedGaussianSize + pack.num_features + 1);
-  if (numbers == 0) return;
-  pack_footprints_kernel<<<blocks_for(numbers, kStoreBlock), kStoreBlock, 0, work.stream>>>(pack);
-  DSMOE_CHECK_LAUNCH("pack_footprints");
 }
 
 template <class S> void project_radii(const Frame<S>& frame, const Work& work) {

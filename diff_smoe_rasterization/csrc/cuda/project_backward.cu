@@ -1,4 +1,5 @@
 // From one record per Gaussian to the gradients of every input. Also writes the zeros of Gaussians that no pixel saw.
+#include "lane_gradient.cuh"
 #include "reduce.cuh"
 #include "sh_rows.cuh"
 
@@ -57,43 +58,6 @@ __device__ ProjectedGradient<S> image_gradient(const ProjectBackwardArguments<S>
 constexpr int kRecordLength = kNumGateMoments + kFastFeatures;  // of colours
 constexpr int kMostRecordLength = kRecordLength + kMostFurtherFeatures;
 using RecordRows = WarpRows<kRecordLength>;
-
-// The gradients of a lane's Gaussian, but for those of its SH row.
-struct LaneGradient {
-  GaussianGradient<float> gaussian;
-  float dc[3];  // if degree 0 lies apart
-};
-
-// Stores the gradients of a warp's Gaussians, zeros included, as far as these exist. rows: the gradients of the SH
-// rows, in shared memory. That memory serves the other gradients too, so that the warp writes each array in one piece.
-// wanted: the lanes whose Gaussians have rows to write.
-template <class Rows>
-__device__ void store_gradients(const LaneGradient& gradient, const Rows& rows,
-                                const ProjectBackwardArguments<float>& arguments, unsigned wanted) {
-  const GaussianGradient<float>& own = gradient.gaussian;
-  const GaussianGradients<float>& to = arguments.gradients;
-  const int lane = rows.lane(), exist = rows.exist();
-  const int64_t first = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x - lane;
-  if (to.shs != nullptr) rows.store(to.shs + first * Rows::kLength, wanted);
-  if (wanted >> lane & 1) {
-    if (to.opacities != nullptr) to.opacities[first + lane] = own.opacity;
-    if (to.rotations != nullptr) {
-      reinterpret_cast<float4*>(to.rotations)[first + lane] =
-          make_float4(own.rotation.x, own.rotation.y, own.rotation.z, own.rotation.w);
-    }
-  }
-  __syncwarp();
-  const auto store_threes = [&](float* array, Vec3<float> value, int place) {
-    if (array == nullptr) return;
-    const WarpRows<3> threes(rows.memory() + place * 3 * kWarp, 3, exist, lane);
-    threes.write({value.x, value.y, value.z});
-    threes.store(array + 3 * first, wanted);
-  };
-  store_threes(to.means3D, own.mean, 0);
-  store_threes(to.means2D, {own.mean2D.x, own.mean2D.y, 0}, 1);
-  store_threes(to.scales, own.scale, 2);
-  if (Rows::kDcApart) store_threes(to.dc, load3(gradient.dc), 3);
-}
 
 // The common case. The SH rows come through shared memory. So do the records if they are of colours only. All other
 // numbers live in registers.
@@ -155,7 +119,7 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
   } else {
     rows.write(dL_dsh);
   }
-  store_gradients(gradient, rows, arguments, arguments.gradients.seen_only ? all_seen : rows.all());
+  store_gradients(gradient, rows, arguments.gradients, arguments.gradients.seen_only ? all_seen : rows.all());
   if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
 }
 

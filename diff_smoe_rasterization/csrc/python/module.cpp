@@ -26,6 +26,7 @@ py::dict constants() {
   out["alpha_cut"] = kAlphaCut;
   out["gate_cut"] = kGateCut;
   out["core_kernel"] = kCoreKernel;
+  out["most_views"] = kMostViews;
   out["core_alpha"] = kCoreAlpha;
   out["tail_alpha"] = kTailAlpha;
   out["every_tail_alpha"] = kEveryTailAlpha;

@@ -1,6 +1,4 @@
 // The ops on the CPU.
-#include <cstring>
-
 #include "cpu/parallel.h"
 #include "dsmoe/training/neighbors.h"
 #include "ops.h"
@@ -172,21 +170,11 @@ struct Cpu {
     cpu::importance(own, map);
   }
 
-  static Tensor pack_footprints(const Tensor& gates, const Tensor& features, const Tensor& radii,
-                                const Tensor& visible) {
-    const Tensor dense_gates = gates.contiguous(), dense_features = features.contiguous();
-    const int64_t count = visible.numel(), num_features = features.size(1);
-    const Tensor out = empty({count, kProjectedGaussianSize + num_features + 1}, gates);
-    float* row = out.data_ptr<float>();
-    for (int64_t i = 0; i < count; ++i) {
-      const int64_t index = visible.data_ptr<int64_t>()[i];
-      DSMOE_CHECK_INDEX(0 <= index && index < gates.size(0), "pack_footprints: visible[", i, "] is ", index,
-                        "; there are ", gates.size(0), " Gaussians");
-      row = std::copy_n(dense_gates.data_ptr<float>() + index * kProjectedGaussianSize, kProjectedGaussianSize, row);
-      row = std::copy_n(dense_features.data_ptr<float>() + index * num_features, num_features, row);
-      std::memcpy(row++, radii.data_ptr<int32_t>() + index, sizeof(float));
-    }
-    return out;
+  using ViewBatch = cpu::ViewBatch;
+  static void count_rows(const ViewBatch& batch) { cpu::count_rows(batch); }
+  static void project_rows(const ViewBatch& batch) { cpu::project_rows(batch); }
+  static void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients) {
+    cpu::project_rows_backward(batch, gradients);
   }
 
   static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {

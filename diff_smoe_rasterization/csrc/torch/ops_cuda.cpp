@@ -212,24 +212,11 @@ struct Cuda {
     cuda::importance(own, map, {how.stream, &memory, nullptr, how.deterministic});
   }
 
-  static Tensor pack_footprints(const Tensor& gates, const Tensor& features, const Tensor& radii,
-                                const Tensor& visible) {
-    const int64_t num_features = features.size(1), columns = feature_columns(num_features);
-    // Features as `project` returns them need no copy.
-    const bool in_rows = features.stride(0) == columns && features.stride(1) == 1;
-    const Tensor rows = in_rows ? features : padded(features, columns), dense = gates.contiguous();
-    const Tensor out = empty({visible.numel(), kProjectedGaussianSize + num_features + 1}, gates);
-    cuda::FootprintRows pack;
-    pack.num_gaussians = gates.size(0);
-    pack.count = visible.numel();
-    pack.gaussians = visible.data_ptr<int64_t>();
-    pack.projected = dense.data_ptr<float>();
-    pack.features = rows.data_ptr<float>();
-    pack.num_features = static_cast<int>(num_features);
-    pack.radii = radii.data_ptr<int32_t>();
-    pack.rows = out.data_ptr<float>();
-    cuda::pack_footprints(pack, {current_stream()});
-    return out;
+  using ViewBatch = cuda::ViewBatch;
+  static void count_rows(const ViewBatch& batch) { cuda::count_rows(batch, {current_stream()}); }
+  static void project_rows(const ViewBatch& batch) { cuda::project_rows(batch, {current_stream()}); }
+  static void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients) {
+    cuda::project_rows_backward(batch, gradients, {current_stream()});
   }
 
   static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {

@@ -45,7 +45,7 @@ const std::string kRadii = "radii(" + kInputs + without_comma(kOptions) + ") -> 
 
 // The two halves of rasterize, with the footprints of N Gaussians between them: what the blend reads of each. gates:
 // [N, 8], `projected` of params.h; features: [N, F], the colour's channels, then z and 1 / z where the options ask for
-// them; radii: [N]. Footprints of equal depth are blended in their order.
+// them; radii: [N]. The blend also takes features whose rows are filled up to a multiple of four. Footprints of equal depth are blended in their order.
 const std::string kProject =
     "project(" + kInputs + without_comma(kOptions) + ") -> (Tensor gates, Tensor features, Tensor radii)";
 const std::string kBlend = "blend(Tensor gates, Tensor features, Tensor radii, Tensor bg, Tensor? background_gate, " +
@@ -63,11 +63,22 @@ const std::string kProjectBackward =
     "Tensor radii, " +
     kOptions + "bool[] wanted) -> Tensor[]";
 
-// Some footprints, those of the Gaussians `visible` [M], as rows to be sent: [M, 8 + F + 1] float32, of which the last
-// number has the bits of the radius. An index out of range is an error on the CPU. On CUDA, where the host does not
-// wait, it gives a row of NaN.
-const char* const kPackFootprints =
-    "pack_footprints(Tensor gates, Tensor features, Tensor radii, Tensor visible) -> Tensor";
+// The first half for a batch of V views (params.h), whose arguments are those of the first view but for the cameras:
+// viewmatrix, projmatrix and campos of each view, and width, height, tanfovx and tanfovy of each. float32.
+const std::string kBatch = kInputs + kOptions + "Tensor[] cameras, float[] images";
+
+// radii [V, N] and offsets [V, blocks + 1] int32: the last offset of a view says how many rows it has.
+const std::string kCountRows = "count_rows(" + kBatch + ") -> (Tensor radii, Tensor offsets)";
+
+// Fills gates [M, 8] and features [M, 4] of each view.
+const std::string kProjectRows = "project_rows(" + kBatch +
+                                 ", Tensor(a!) radii, Tensor offsets, Tensor(b!)[] gates, Tensor(c!)[] features) -> ()";
+
+// records: [M, 9] of each view. dL_dmeans2D: [V, N, 3], written where the radius is above 0. gradients: those by the
+// Gaussians that the arguments hold, but for means2D, in their order, summed over the views.
+const std::string kProjectRowsBackward =
+    "project_rows_backward(" + kBatch +
+    ", Tensor radii, Tensor offsets, Tensor[] features, Tensor[] records) -> (Tensor dL_dmeans2D, Tensor[] gradients)";
 
 // From a map [H, W] and what one rasterize saved: sums over the pixels of each Gaussian.
 const std::string kContributions =
@@ -96,7 +107,9 @@ DSMOE_LIBRARY(m) {
   m.def(kProjectBackward.c_str());
   m.def(kBlend.c_str());
   m.def(kBlendBackward.c_str());
-  m.def(kPackFootprints);
+  m.def(kCountRows.c_str());
+  m.def(kProjectRows.c_str());
+  m.def(kProjectRowsBackward.c_str());
   m.def(kContributions.c_str());
   m.def(kImportance.c_str());
   m.def(kGateMap.c_str());

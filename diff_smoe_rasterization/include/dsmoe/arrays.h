@@ -211,14 +211,10 @@ template <class S> struct PixelSums {
   S depth = 0;                  // by its view depth, if others than the pixels read that
 };
 
-// The gradient of Gaussian i that a record of FootprintGradients has. features: what the forward pass wrote of it.
-template <class S>
-DSMOE_HD PixelSums<S> pixel_sums(const FootprintGradients<S>& gradients, int64_t i, int num_features,
-                                 const S* features) {
-  const S* record = gradients.records + i * (kNumGateGradients + num_features);
+// What a record of FootprintGradients says. features: what the forward pass wrote of the Gaussian.
+template <class S> DSMOE_HD PixelSums<S> pixel_sums(const S* record, const S* features) {
   return {{{record[0], record[1]}, {record[2], record[3], record[4]}, record[5]},
-          {features, record + kNumGateGradients},
-          gradients.depths != nullptr ? gradients.depths[i] : S(0)};
+          {features, record + kNumGateGradients}};
 }
 
 // Writes the gate's part of such a record.
@@ -227,6 +223,34 @@ template <class S> DSMOE_HD void store_gate_gradient(const GateGradient<S>& gate
   record[2] = gate.conic.xx, record[3] = gate.conic.xy, record[4] = gate.conic.yy;
   record[5] = gate.opacity;
 }
+
+// The gradients of a Gaussian over views. kShs: numbers that there is room for.
+template <int kShs> struct ViewSum {
+  GaussianGradient<float> gaussian = {};
+  float dc[3] = {}, shs[kShs] = {};
+
+  // Adds those that a view gives. features: of the Gaussian's row; record: as FootprintGradients has them. Returns the
+  // view's own gradient, mean2D among them.
+  DSMOE_HD GaussianGradient<float> add(const Gaussian<float>& from, const ColorSource<float>& source,
+                                       const float* features, const float* record) {
+    float by_dc[3] = {}, by_shs[kShs] = {};
+    const PixelSums<float> sums = pixel_sums(record, features);
+    const Vec3<float> color = write_color_gradients(source, sums.features, {nullptr, by_dc, by_shs});
+    const GaussianGradient<float> view =
+        project_backward(from, source.camera, source.config.projection_rules(),
+                         projected_gradient(sums.gate, sums.features.dL_dvalues, color, source.config));
+    gaussian.mean = gaussian.mean + view.mean;
+    gaussian.opacity += view.opacity;
+    gaussian.scale = gaussian.scale + view.scale;
+    gaussian.rotation.x += view.rotation.x, gaussian.rotation.y += view.rotation.y;
+    gaussian.rotation.z += view.rotation.z, gaussian.rotation.w += view.rotation.w;
+    DSMOE_UNROLL
+    for (int k = 0; k < 3; ++k) dc[k] += by_dc[k];
+    DSMOE_UNROLL
+    for (int k = 0; k < kShs; ++k) shs[k] += by_shs[k];
+    return view;
+  }
+};
 
 // Writes the gradients of a Gaussian, but for coefficients above the active degree. Returns the Gaussian's share of the
 // camera's gradient.

@@ -9,6 +9,7 @@
 #include <limits>
 #include <optional>
 #include <string_view>
+#include <vector>
 
 #include "dsmoe/blend.h"
 #include "dsmoe/project.h"
@@ -224,6 +225,34 @@ template <class S, class BackendCamera, class BackendSaved> struct RenderingFram
   RasterConfig<S> config;    // how
   ImageOutputs<S> images;    // where the results go
   BackendSaved saved;        // filled by `forward`
+};
+
+// A batch: several views of the same Gaussians. The footprints that a view sees lie side by side in rows, in the order
+// of the Gaussians, so that they can be sent and blended as they are. Rows are counted by blocks of Gaussians: a
+// Gaussian finds its own by those before it in its block.
+constexpr int kViewBlock = 128;  // Gaussians
+constexpr int kMostViews = 16;   // of one batch
+constexpr int kRowFeatures = 4;  // numbers: a colour, and the bits of the radius
+inline int64_t num_view_blocks(int64_t num_gaussians) { return (num_gaussians + kViewBlock - 1) / kViewBlock; }
+
+// The radius of a Gaussian that has a row, and is culled all the same: its colour is not finite. Its row is zero.
+constexpr int32_t kCulledInRow = -1;
+
+template <class BackendCamera> struct BatchView {
+  BackendCamera camera;
+  int32_t* radii = nullptr;        // [N] pixels; 0 if the Gaussian has no row
+  int32_t* offsets = nullptr;      // [num_view_blocks(N) + 1] first row of each block; the last entry: how many rows
+  int64_t num_rows = 0;            // M, as the caller has read it there
+  float* gates = nullptr;          // [M, kProjectedGaussianSize]
+  float* features = nullptr;       // [M, kRowFeatures]
+  const float* records = nullptr;  // [M, kNumGateGradients + 3] as FootprintGradients has them
+  float* means2D = nullptr;        // [N, 3] gradients, written where the radius is above 0
+};
+
+template <class BackendCamera> struct ViewBatch {
+  GaussianInputs<float> inputs;  // with scales, rotations and spherical harmonics
+  RasterConfig<float> config;    // of colours alone
+  std::vector<BatchView<BackendCamera>> views;
 };
 
 // What a backward pass is given and what it writes.

@@ -63,6 +63,19 @@ void project_backward(const Frame<S>& frame, const FootprintGradients<S>& footpr
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, Scratch& scratch);
 
+// The first half for the views of a batch. A caller counts the rows, allocates them, and has them filled.
+using ViewBatch = dsmoe::ViewBatch<Camera<float>>;
+
+// Fills radii and offsets of each view.
+void count_rows(const ViewBatch& batch);
+
+// Fills gates and features of each view, and corrects its radii: kCulledInRow.
+void project_rows(const ViewBatch& batch);
+
+// Writes gradients, sums over the views in their order, and means2D of each view, from the records. gradients: those
+// by means3D, opacities, scales, rotations, dc and shs.
+void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients);
+
 // The sizes of what `forward` keeps. How many instances there are is not known yet.
 template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
   SavedSizes sizes;

@@ -17,7 +17,7 @@
 //
 // A launch that failed is a std::runtime_error that says why. Null pointers and numbers out of range are a
 // std::invalid_argument, which names them and what would be right. Of the stages only `contributions`, `importance`,
-// `gate_map` and `mark_visible` look.
+// `gate_map`, `mark_visible` and those of batches look.
 #pragma once
 
 #include <cstddef>
@@ -268,18 +268,11 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
 // what `contributions` does.
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work);
 
-// Some footprints as rows of numbers, to be sent.
-struct FootprintRows {
-  int64_t num_gaussians = 0;           // N
-  int64_t count = 0;                   // M
-  const int64_t* gaussians = nullptr;  // [M] which footprints; of others than 0 to N - 1 the row is NaN
-  const float* projected = nullptr;    // [N, kProjectedGaussianSize]
-  const float* features = nullptr;     // [N, feature_stride(F)]
-  int num_features = 0;                // F
-  const int32_t* radii = nullptr;      // [N]
-  float* rows = nullptr;  // [M, kProjectedGaussianSize + F + 1] written; the last number is the radius' bits
-};
-void pack_footprints(const FootprintRows& pack, const Work& work);
+// The first half for the views of a batch, as in rasterize.h. A row behind num_rows is neither written nor read.
+using ViewBatch = dsmoe::ViewBatch<DeviceCamera<float>>;
+void count_rows(const ViewBatch& batch, const Work& work);
+void project_rows(const ViewBatch& batch, const Work& work);
+void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients, const Work& work);
 
 // Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
 // visible: [N].

@@ -383,34 +383,103 @@ TEST(Kernels, OrderFootprintsByTheirDepthsAlsoNegativeOnes) {
   EXPECT_EQ(order, (std::vector<int32_t>{5, 1, 2, 4, 6, 0, 7}));
 }
 
-TEST(Kernels, PackNoFootprintsThatAreNotThere) {
-  // Three footprints of three features, between numbers that belong to nobody.
-  std::vector<float> projected(5 * kProjectedGaussianSize, -1), features(5 * 4, -1);
-  std::vector<int32_t> radii(5, -1);
-  const std::vector<int64_t> gaussians = {2, -1, 3, int64_t(1) << 40, 0};
-  const int width = kProjectedGaussianSize + 4;
-  std::vector<float> rows(gaussians.size() * width);
-  for (int i = 1; i < 4; ++i) {
-    for (int k = 0; k < kProjectedGaussianSize; ++k) projected[i * kProjectedGaussianSize + k] = static_cast<float>(i);
-    for (int f = 0; f < 3; ++f) features[4 * i + f] = static_cast<float>(i);
-    radii[i] = 0;
-  }
-  cuda::FootprintRows pack;
-  pack.num_gaussians = 3, pack.count = static_cast<int64_t>(gaussians.size());
-  pack.gaussians = gaussians.data(), pack.num_features = 3, pack.rows = rows.data();
-  pack.projected = projected.data() + kProjectedGaussianSize, pack.features = features.data() + 4;
-  pack.radii = radii.data() + 1;
-  cuda::pack_footprints(pack, {});
-  for (size_t row = 0; row < gaussians.size(); ++row) {
-    for (int k = 0; k < width; ++k) {
-      const float number = rows[row * width + k];
-      if (gaussians[row] != 0 && gaussians[row] != 2) {
-        EXPECT_TRUE(std::isnan(number)) << row << " " << k;
-      } else {
-        EXPECT_EQ(number, k + 1 < width ? gaussians[row] + 1 : 0) << row << " " << k;
+// What the views of a batch see, and the gradients by the Gaussians; for three cameras, side by side.
+struct BatchResults {
+  explicit BatchResults(const Scene<float>& scene) : gradient(scene) {
+    for (int v = 0; v < 3; ++v) {
+      Camera<float> camera = scene.camera;
+      for (int row = 0; row < 2; ++row) camera.view[12 + row] += 0.7f * static_cast<float>(v);
+      for (int row = 0; row < 4; ++row) {
+        camera.projection[12 + row] +=
+            0.4f * static_cast<float>(v) * (camera.projection[row] + camera.projection[4 + row]);
       }
+      cameras.push_back(camera);
+      radii.emplace_back(scene.count, -5), offsets.emplace_back(num_view_blocks(scene.count) + 1, -5);
     }
   }
+
+  // fewer: rows that are left out of those that were counted.
+  template <class Batch, class Count, class Project, class Backward>
+  void run(const Scene<float>& scene, Batch batch, int fewer, Count count, Project project, Backward backward) {
+    batch.inputs = scene.inputs(), batch.config = scene.raster_config();
+    for (size_t v = 0; v < batch.views.size(); ++v) {
+      batch.views[v].radii = radii[v].data(), batch.views[v].offsets = offsets[v].data();
+    }
+    count(batch);
+    for (size_t v = 0; v < batch.views.size(); ++v) {
+      auto& view = batch.views[v];
+      view.num_rows = offsets[v].back() - fewer;
+      Random random(11);  // of each view: what differs between the views is the cameras
+      for (auto* rows : {&gates, &features}) rows->emplace_back(view.num_rows * 8 + 1, 7.0f);
+      const std::vector<double> numbers = random.uniforms(9 * offsets[v].back());
+      records.emplace_back(numbers.begin(), numbers.end());
+      means2D.emplace_back(3 * scene.count, 7.0f);
+      view.gates = gates[v].data(), view.features = features[v].data();
+      view.records = records[v].data(), view.means2D = means2D[v].data();
+    }
+    project(batch);
+    backward(batch, gradient.gradients());
+  }
+
+  std::vector<Camera<float>> cameras;
+  std::vector<std::vector<int32_t>> radii, offsets;
+  std::vector<std::vector<float>> gates, features, records, means2D;
+  SceneGradient<float> gradient;
+};
+
+BatchResults batch_on_cpu(const Scene<float>& scene) {
+  BatchResults out(scene);
+  cpu::ViewBatch batch;
+  for (const Camera<float>& camera : out.cameras) batch.views.emplace_back().camera = camera;
+  out.run(scene, batch, 0, cpu::count_rows, cpu::project_rows, cpu::project_rows_backward);
+  return out;
+}
+
+BatchResults batch_by_kernels(const Scene<float>& scene, int fewer = 0) {
+  BatchResults out(scene);
+  cuda::ViewBatch batch;
+  for (const Camera<float>& camera : out.cameras) {
+    batch.views.emplace_back().camera = {camera.width, camera.height, camera.tan_fov_x,  camera.tan_fov_y,
+                                         camera.near,  camera.view,   camera.projection, camera.position};
+  }
+  out.run(
+      scene, batch, fewer, [](const auto& batch) { cuda::count_rows(batch, {}); },
+      [](const auto& batch) { cuda::project_rows(batch, {}); },
+      [](const auto& batch, const auto& gradients) { cuda::project_rows_backward(batch, gradients, {}); });
+  return out;
+}
+
+std::vector<double> widened(const std::vector<float>& numbers) { return {numbers.begin(), numbers.end()}; }
+
+TEST(Kernels, TakeTheViewsOfABatchAsTheCpu) {
+  Scene<double> no_shs = make_scene(4, 300, 41, 23);
+  no_shs.sh_degree = 0, no_shs.dc = no_shs.shs, no_shs.dc.resize(3 * no_shs.count), no_shs.shs.clear();
+  for (Scene<double> of : {with_degree_3(make_scene(3, 300, 41, 23), false), make_scene(3, 129, 41, 23), no_shs,
+                           with_degree_3(make_scene(3, 300, 41, 23), true), make_scene(3, 0, 41, 23)}) {
+    if (of.count > 0) (of.dc.empty() ? of.shs : of.dc)[3 * 40] = NAN;  // that Gaussian has a row, and is culled
+    const Scene<float> scene = convert<float>(of);
+    const BatchResults expected = batch_on_cpu(scene), actual = batch_by_kernels(scene);
+    for (size_t v = 0; v < actual.cameras.size(); ++v) {
+      EXPECT_EQ(actual.radii[v], expected.radii[v]);
+      EXPECT_EQ(actual.offsets[v], expected.offsets[v]);
+      EXPECT_TRUE(of.count == 0 || actual.offsets[v].back() > 20);
+      expect_near(actual.features[v], widened(expected.features[v]), "features");
+      expect_near(actual.gates[v], widened(expected.gates[v]), "gates");
+      for (int64_t i = 0; i < of.count; ++i) {
+        EXPECT_NEAR(actual.means2D[v][3 * i], expected.means2D[v][3 * i], 1e-5) << i;
+      }
+    }
+    for (const auto array : {&Scene<float>::means3D, &Scene<float>::opacities, &Scene<float>::scales,
+                             &Scene<float>::rotations, &Scene<float>::dc, &Scene<float>::shs}) {
+      expect_near(actual.gradient.by.*array, widened(expected.gradient.by.*array), "gradients");
+    }
+  }
+}
+
+// A caller that has read another number of rows than there are gets no numbers from behind its memory.
+TEST(Kernels, TouchNoRowsBehindThoseOfABatch) {
+  const BatchResults out = batch_by_kernels(convert<float>(with_degree_3(make_scene(3, 150, 41, 23), true)), 5);
+  for (const auto& gates : out.gates) EXPECT_EQ(gates.back(), 7.0f);
 }
 
 // If pixels do not stop, both passes evaluate all pairs of the entries that meet a square.

@@ -1,0 +1,279 @@
+// The first half of a rendering for the views of a batch, and back. A thread takes a Gaussian through all views, so
+// that its numbers are read once, and so that its gradients are written once.
+#include <algorithm>
+
+#include "../refuse.h"
+#include "lane_gradient.cuh"
+
+namespace dsmoe {
+namespace cuda {
+namespace {
+
+static_assert(kViewBlock == kRowsBlock, "a block of threads has a block of Gaussians");
+constexpr int kViewWarps = kViewBlock / kWarp;
+
+struct BatchArguments {
+  GaussianInputs<float> inputs;
+  RasterConfig<float> config;
+  GaussianGradients<float> gradients;  // of the backward pass
+  int num_views;
+  BatchView<DeviceCamera<float>> views[kMostViews];
+};
+static_assert(sizeof(BatchArguments) <= 4096, "what every card takes as arguments of a kernel");
+
+BatchArguments arguments_of(const ViewBatch& batch) {
+  BatchArguments arguments = {};
+  arguments.inputs = batch.inputs, arguments.config = batch.config;
+  arguments.num_views = static_cast<int>(batch.views.size());
+  std::copy(batch.views.begin(), batch.views.end(), arguments.views);
+  return arguments;
+}
+
+// All threads of the block take part. No barrier.
+__device__ void load_cameras(const BatchArguments& arguments, Camera<float>* cameras) {
+  for (int v = 0; v < arguments.num_views; ++v) load_camera(arguments.views[v].camera, cameras[v]);
+}
+
+// Where the rows of a thread's Gaussian are.
+class RowsOfViews {
+ public:
+  // counts: [views, warps] in shared memory. All threads of the block take part, which then wait for each other.
+  __device__ RowsOfViews(const BatchArguments& arguments, int64_t i, int* counts)
+      : arguments_(arguments), i_(i), exists_(i < arguments.inputs.num_gaussians), counts_(counts) {
+    const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+    for (int v = 0; v < arguments.num_views; ++v) {
+      const int32_t own = radius(v);
+      const unsigned all = __ballot_sync(kAllLanes, own != 0);
+      seen_ |= own > 0;
+      if (lane == 0) counts[v * kViewWarps + warp] = __popc(all);
+    }
+  }
+
+  // Whether a view sees the Gaussian.
+  __device__ bool seen() const { return seen_; }
+
+  __device__ int32_t radius(int v) const { return exists_ ? arguments_.views[v].radii[i_] : 0; }
+
+  // The Gaussian's row in a view, -1 if it has none. After a barrier; all lanes of the warp take part.
+  __device__ int64_t row(int v, int32_t radius) const {
+    const unsigned all = __ballot_sync(kAllLanes, radius != 0);
+    const auto& view = arguments_.views[v];
+    int64_t row = view.offsets[blockIdx.x];
+    for (int warp = 0; warp < threadIdx.x / kWarp; ++warp) row += counts_[v * kViewWarps + warp];
+    row += __popc(all & ((1u << threadIdx.x % kWarp) - 1));
+    return radius != 0 && row < view.num_rows ? row : -1;
+  }
+
+ private:
+  const BatchArguments& arguments_;
+  const int64_t i_;
+  const bool exists_;
+  const int* counts_;
+  bool seen_ = false;
+};
+
+__global__ void __launch_bounds__(kViewBlock) count_rows_kernel(const __grid_constant__ BatchArguments arguments) {
+  __shared__ Camera<float> cameras[kMostViews];
+  __shared__ int counts[kMostViews];
+  const int64_t i = int64_t(blockIdx.x) * kViewBlock + threadIdx.x;
+  const bool exists = i < arguments.inputs.num_gaussians;
+  const Gaussian<float> gaussian = load_gaussian(arguments.inputs, exists ? i : 0);
+  load_cameras(arguments, cameras);
+  if (threadIdx.x < arguments.num_views) counts[threadIdx.x] = 0;
+  __syncthreads();
+  for (int v = 0; v < arguments.num_views; ++v) {
+    int32_t radius = 0;
+    if (exists) {
+      radius = project(gaussian, cameras[v], arguments.config.projection_rules()).radius;
+      arguments.views[v].radii[i] = radius;
+    }
+    const unsigned all = __ballot_sync(kAllLanes, radius > 0);
+    if (threadIdx.x % kWarp == 0) atomicAdd(&counts[v], __popc(all));
+  }
+  __syncthreads();
+  if (threadIdx.x < arguments.num_views) arguments.views[threadIdx.x].offsets[blockIdx.x] = counts[threadIdx.x];
+}
+
+// Makes first rows of the counts, in one block for each view. A thread adds up a strip of them.
+__global__ void __launch_bounds__(kSortBlock)
+    add_up_rows_kernel(const __grid_constant__ BatchArguments arguments, int64_t blocks) {
+  __shared__ int32_t sums[kSortBlock];
+  int32_t* offsets = arguments.views[blockIdx.x].offsets;
+  const int64_t strip = (blocks + kSortBlock - 1) / kSortBlock;
+  const int64_t begin = min(blocks, strip * threadIdx.x), end = min(blocks, begin + strip);
+  int32_t sum = 0;
+  for (int64_t block = begin; block < end; ++block) sum += offsets[block];
+  sums[threadIdx.x] = sum;
+  for (int step = 1; step < kSortBlock; step *= 2) {
+    __syncthreads();
+    const int32_t before = threadIdx.x >= step ? sums[threadIdx.x - step] : 0;
+    __syncthreads();
+    sums[threadIdx.x] += before;
+  }
+  int32_t first = sums[threadIdx.x] - sum;
+  for (int64_t block = begin; block < end; ++block) {
+    const int32_t count = offsets[block];
+    offsets[block] = first;
+    first += count;
+  }
+  if (threadIdx.x == kSortBlock - 1) offsets[blocks] = first;
+}
+
+// The SH row of a lane's Gaussian as the colours read it.
+template <class Rows>
+__device__ Colors<float> colors_in(const Rows& rows, const GaussianInputs<float>& inputs, int64_t i, const float* dc) {
+  if constexpr (Rows::kKnown) return Rows::known_colors(dc, rows.own());
+  Colors<float> colors = colors_of(inputs, kFastFeatures, i);
+  if (Rows::kStaged) colors.shs = rows.own();
+  return colors;
+}
+
+template <class Rows>
+__global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_constant__ BatchArguments arguments) {
+  __shared__ Camera<float> cameras[kMostViews];
+  __shared__ int counts[kMostViews * kViewWarps];
+  extern __shared__ float4 shared_rows[];
+  const GaussianInputs<float>& inputs = arguments.inputs;
+  const int64_t i = int64_t(blockIdx.x) * kViewBlock + threadIdx.x;
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp, length = 3 * inputs.num_sh;
+  const int64_t first = i - lane, own = i < inputs.num_gaussians ? i : 0;
+  const int exist = static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, inputs.num_gaussians - first)));
+  load_cameras(arguments, cameras);
+  const RowsOfViews of_views(arguments, i, counts);
+  const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length, exist, lane);
+  if constexpr (Rows::kStaged) {
+    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.seen()));
+    wait_for_copies();
+  }
+  __syncthreads();
+  const Gaussian<float> gaussian = Rows::gaussian(inputs, own);
+  float dc[3] = {};
+  if constexpr (Rows::kDcApart) store3(dc, load3(inputs.dc + 3 * own));
+  RasterConfig<float> config = arguments.config;
+  config.num_channels = kFastFeatures;
+  config.leave_out_further_features();
+  for (int v = 0; v < arguments.num_views; ++v) {
+    const auto& view = arguments.views[v];
+    int32_t radius = of_views.radius(v);
+    const int64_t row = of_views.row(v, radius);
+    if (row < 0) continue;
+    auto projected = project(gaussian, cameras[v], config.projection_rules()).gaussian;
+    float features[kFastFeatures] = {};
+    if (!write_features<float>({colors_in(rows, inputs, own, dc), gaussian.mean, cameras[v], config}, projected.depth,
+                               features)) {
+      radius = 0, projected = {};
+      features[0] = features[1] = features[2] = 0;
+      view.radii[i] = kCulledInRow;
+    }
+    *reinterpret_cast<ProjectedGaussian<float>*>(view.gates + row * kProjectedGaussianSize) = projected;
+    *reinterpret_cast<float4*>(view.features + row * kRowFeatures) =
+        make_float4(features[0], features[1], features[2], __int_as_float(radius));
+  }
+}
+
+template <class Rows>
+__global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlocks : 1)
+    project_rows_backward_kernel(const __grid_constant__ BatchArguments arguments) {
+  __shared__ Camera<float> cameras[kMostViews];
+  __shared__ int counts[kMostViews * kViewWarps];
+  extern __shared__ float4 shared_rows[];
+  const GaussianInputs<float>& inputs = arguments.inputs;
+  const GaussianGradients<float>& gradients = arguments.gradients;
+  const int64_t i = int64_t(blockIdx.x) * kViewBlock + threadIdx.x;
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp, length = 3 * inputs.num_sh;
+  const int64_t first = i - lane, own = i < inputs.num_gaussians ? i : 0;
+  const int exist = static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, inputs.num_gaussians - first)));
+  load_cameras(arguments, cameras);
+  const RowsOfViews of_views(arguments, i, counts);
+  const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length, exist, lane);
+  if constexpr (Rows::kStaged) {
+    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.seen()));
+    wait_for_copies();
+  }
+  __syncthreads();
+  const Gaussian<float> gaussian = Rows::gaussian(inputs, own);
+  float dc[3] = {};
+  if constexpr (Rows::kDcApart) store3(dc, load3(inputs.dc + 3 * own));
+  RasterConfig<float> config = arguments.config;
+  config.num_channels = kFastFeatures;
+  config.leave_out_further_features();
+  ViewSum<Rows::kKnown ? Rows::kLength : kAllShLength> sum;
+  for (int v = 0; v < arguments.num_views; ++v) {
+    const auto& view = arguments.views[v];
+    const int32_t radius = of_views.radius(v);
+    const int64_t row = of_views.row(v, radius);
+    if (row < 0 || radius < 0) continue;
+    const float4 four = *reinterpret_cast<const float4*>(view.features + row * kRowFeatures);
+    const float features[kFastFeatures] = {four.x, four.y, four.z};
+    float record[kNumGateGradients + kFastFeatures];
+    for (int k = 0; k < kNumGateGradients + kFastFeatures; ++k) {
+      record[k] = view.records[row * (kNumGateGradients + kFastFeatures) + k];
+    }
+    const auto by_view =
+        sum.add(gaussian, {colors_in(rows, inputs, own, dc), gaussian.mean, cameras[v], config}, features, record);
+    if (view.means2D != nullptr) store3<float>(view.means2D + 3 * i, {by_view.mean2D.x, by_view.mean2D.y, 0});
+  }
+  __syncwarp();
+  if constexpr (Rows::kKnown) {
+    rows.write(sum.shs);
+    store_gradients<Rows>({sum.gaussian, {sum.dc[0], sum.dc[1], sum.dc[2]}}, rows, gradients, rows.all());
+  } else {
+    if (i < inputs.num_gaussians) {
+      store_gradient(sum.gaussian, gradients, i);
+      if (gradients.dc != nullptr) store3(gradients.dc + 3 * i, load3(sum.dc));
+      for (int k = 0; gradients.shs != nullptr && k < length; ++k) {
+        (Rows::kStaged ? rows.own() : gradients.shs + i * length)[k] = sum.shs[k];
+      }
+    }
+    if constexpr (Rows::kStaged) {
+      if (gradients.shs != nullptr) rows.store(gradients.shs + first * length, rows.all());
+    }
+  }
+}
+
+template <class Launch> void launch_rows(const ViewBatch& batch, bool aligned, const Launch& launch) {
+  dispatch_sh_rows(batch.inputs, aligned, [&](auto type, size_t shared) {
+    launch(type, static_cast<unsigned>(num_view_blocks(batch.inputs.num_gaussians)), shared);
+  });
+}
+
+}  // namespace
+
+void count_rows(const ViewBatch& batch, const Work& work) {
+  refuse_batch<Frame<float>>("cuda::count_rows", batch, [](const auto&) {});
+  const BatchArguments arguments = arguments_of(batch);
+  const int64_t blocks = num_view_blocks(batch.inputs.num_gaussians);
+  if (blocks > 0) {
+    count_rows_kernel<<<static_cast<unsigned>(blocks), kViewBlock, 0, work.stream>>>(arguments);
+    DSMOE_CHECK_LAUNCH("count_rows");
+  }
+  add_up_rows_kernel<<<arguments.num_views, kSortBlock, 0, work.stream>>>(arguments, blocks);
+  DSMOE_CHECK_LAUNCH("add_up_rows");
+}
+
+void project_rows(const ViewBatch& batch, const Work& work) {
+  refuse_rows<Frame<float>>("cuda::project_rows", batch, false);
+  if (batch.inputs.num_gaussians == 0) return;
+  const BatchArguments arguments = arguments_of(batch);
+  launch_rows(batch, true, [&](auto type, unsigned blocks, size_t shared) {
+    project_rows_kernel<typename decltype(type)::type><<<blocks, kViewBlock, shared, work.stream>>>(arguments);
+    DSMOE_CHECK_LAUNCH("project_rows");
+  });
+}
+
+void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients, const Work& work) {
+  refuse_rows<Frame<float>>("cuda::project_rows_backward", batch, true);
+  if (batch.inputs.num_gaussians == 0) return;
+  BatchArguments arguments = arguments_of(batch);
+  arguments.gradients = gradients;
+  const bool aligned =
+      are_vector_aligned(gradients.shs, gradients.dc, gradients.means3D, gradients.scales, gradients.rotations);
+  launch_rows(batch, aligned, [&](auto type, unsigned blocks, size_t shared) {
+    using Rows = typename decltype(type)::type;
+    project_rows_backward_kernel<Rows><<<blocks, kViewBlock, shared, work.stream>>>(arguments);
+    DSMOE_CHECK_LAUNCH("project_rows_backward");
+  });
+}
+
+}  // namespace cuda
+}  // namespace dsmoe
