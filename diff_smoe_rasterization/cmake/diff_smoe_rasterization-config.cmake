@@ -75,9 +75,12 @@ if(dsmoe_libtorch)
   set(diff_smoe_rasterization_torch_FOUND TRUE)
   if(NOT TARGET dsmoe::torch)
     add_library(dsmoe::torch SHARED IMPORTED)
+    # A program has PyTorch's libstdc++, also from a toolchain that links a static one. PyTorch would take some symbols
+    # from that, and others from its own: streams would stay without their constructor, and a warning would crash.
     set_target_properties(dsmoe::torch PROPERTIES
       IMPORTED_LOCATION "${dsmoe_package}/_ops.so"
       INTERFACE_INCLUDE_DIRECTORIES "${dsmoe_package}/include"
+      INTERFACE_LINK_OPTIONS -Wl,--push-state,--no-as-needed,-l:libstdc++.so.6,--pop-state
       INTERFACE_LINK_LIBRARIES "dsmoe::core;${dsmoe_libtorch}")
   endif()
 endif()
