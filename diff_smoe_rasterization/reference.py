@@ -211,16 +211,27 @@ def mode_and_gate(settings):
     return mode, gate.reshape(()) if isinstance(gate, torch.Tensor) else gate
 
 
-def _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp):
-    def given(tensor):
-        return None if tensor is None or tensor.shape == (0,) else tensor
+def _given(tensor):
+    return None if tensor is None or tensor.shape == (0,) else tensor
 
-    means2D, dc, shs, colors_precomp = given(means2D), given(dc), given(shs), given(colors_precomp)
-    scales, rotations, cov3D_precomp = given(scales), given(rotations), given(cov3D_precomp)
+
+def appearance(dc, shs, colors_precomp):
+    """Returns shs [N, K, 3] with dc in it, or None, and colors_precomp [N, C], or None: arguments of `rasterize`.
+
+    Raises ValueError unless just one of both is given.
+    """
+    dc, shs, colors_precomp = _given(dc), _given(shs), _given(colors_precomp)
     if dc is not None:
         shs = dc if shs is None else torch.cat([dc, shs], 1)
     if (shs is None) == (colors_precomp is None):
         raise ValueError("rasterize: give either shs or colors_precomp, and not both")
+    return shs, colors_precomp
+
+
+def _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp):
+    means2D = _given(means2D)
+    scales, rotations, cov3D_precomp = _given(scales), _given(rotations), _given(cov3D_precomp)
+    shs, colors_precomp = appearance(dc, shs, colors_precomp)
     if (scales is None) != (rotations is None) or (scales is None) == (cov3D_precomp is None):
         raise ValueError("rasterize: give either scales with rotations or cov3D_precomp, and not both")
     means2D = torch.zeros_like(means3D) if means2D is None else means2D - means2D.detach()

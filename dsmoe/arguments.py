@@ -11,7 +11,7 @@ from . import choices, fast
 from .bench.names import SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
 from .config import PRINCIPAL_POINTS
-from .config_arguments import add_arguments
+from .config_arguments import add_arguments, number, whole_number
 from .patches import TRAINERS
 
 TRAIN_EXAMPLES = """examples:
@@ -89,14 +89,14 @@ def build_parser() -> argparse.ArgumentParser:
                         help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
                              "that ends in .mp4 (needs imageio-ffmpeg), .gif or .webp")
     render.add_argument("--orbit", action="store_true", help="once around what the scene's cameras look at")
-    render.add_argument("--frames", type=int, default=choices.ORBIT_FRAMES, metavar="N",
+    render.add_argument("--frames", type=whole_number, default=choices.ORBIT_FRAMES, metavar="N",
                         help="of an orbit (default: %(default)s)")
-    render.add_argument("--fps", type=float, default=choices.VIDEO_FPS, metavar="X",
+    render.add_argument("--fps", type=number, default=choices.VIDEO_FPS, metavar="X",
                         help=f"of a video (default: {choices.VIDEO_FPS:g})")
     render.add_argument("--split", choices=("test", "train", "all"), default="test",
                         help="which cameras (default: test)")
     _add_model_options(render, "whose cameras are rendered (default: the run's; needed for a .ply)")
-    render.add_argument("--resolution", type=int, metavar="N",
+    render.add_argument("--resolution", type=whole_number, metavar="N",
                         help="as in train (default: the run's, for a .ply -1)")
     render.add_argument("--principal-point", choices=PRINCIPAL_POINTS,
                         help="as in train (default: the run's, for a .ply scene)")
@@ -116,13 +116,13 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
     export.add_argument("--format", choices=choices.EXPORT_FORMATS,
                         help=f"default: by the ending of FILE, else {choices.EXPORT_FORMATS[0]}; spz needs gsply")
-    export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
+    export.add_argument("--sh-degree", type=whole_number, choices=range(4), metavar="N",
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")
     export.add_argument("--bake", choices=("alpha",),
                         help="first fine-tune the model to this blend, which every viewer shows; needs the scene's "
                              "images, and prints the dB that it costs")
-    export.add_argument("--bake-iterations", type=int, default=choices.BAKE_ITERATIONS, metavar="N",
+    export.add_argument("--bake-iterations", type=whole_number, default=choices.BAKE_ITERATIONS, metavar="N",
                         help="(default: %(default)s)")
     _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
     export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
@@ -135,7 +135,8 @@ def build_parser() -> argparse.ArgumentParser:
     _add_model_options(view, "at whose first test view it begins (default: the run's)")
     view.add_argument("--host", default=choices.VIEW_HOST,
                       help="address to serve at; 0.0.0.0: to the network too (default: %(default)s, this machine only)")
-    view.add_argument("--port", type=int, default=choices.VIEW_PORT, help="or the next free one (default: %(default)s)")
+    view.add_argument("--port", type=whole_number, default=choices.VIEW_PORT,
+                      help="or the next free one (default: %(default)s)")
     _add_device(view)
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
@@ -185,7 +186,7 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     parser.add_argument("--scene", help="folder " + scene)
     parser.add_argument("--blend-mode", choices=BLEND_MODES,
                         help="needed for a .ply that does not record it; must agree where it does")
-    parser.add_argument("--background-gate", type=float, metavar="X",
+    parser.add_argument("--background-gate", type=number, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
     parser.add_argument("--white-background", action="store_true", default=None,
                         help="white background (default: the run's, for a .ply black)")
@@ -218,10 +219,10 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--device", choices=choices.DEVICES,
                      help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
-    run.add_argument("--jobs", type=int, metavar="N",
+    run.add_argument("--jobs", type=whole_number, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
                           "FPS stay out of the report)")
-    run.add_argument("--per-gpu", type=int, default=1, metavar="K",
+    run.add_argument("--per-gpu", type=whole_number, default=1, metavar="K",
                      help="cells that share a GPU (default: 1); beyond 1 their times and FPS stay out of the report")
     run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
                      help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120 "

@@ -168,8 +168,11 @@ class TrainConfig:
         self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
         self._require("budget", self.budget >= 0, "at least 0")
-        needs_budget = self.strategy in ("importance", "mcmc")
-        self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.strategy}")
+        if self.strategy in ("importance", "mcmc"):
+            if self.budget == 0:
+                raise ConfigError(f"--strategy {self.strategy} needs --budget, the number of Gaussians to end with: "
+                                  "for example --budget 30000")
+            self._require("budget", self.budget >= 4, f"at least 4 with --strategy {self.strategy}")
         if self.strategy == "importance":
             self.importance_options()
             self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy importance; "

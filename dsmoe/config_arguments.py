@@ -3,11 +3,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from typing import Any, Dict, Optional, Sequence, Union
+from typing import Any, Callable, Dict, Optional, Sequence, Union
 
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES
 
-from .config import LEARNED, TrainConfig, flags_of, learned_gate_of
+from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
 from .errors import ConfigError
 from .fast import budget_of, with_preset
 
@@ -22,14 +22,29 @@ GROUPS = {
 }
 
 
-def _number_or_learned(text: str) -> Union[float, str]:
+def _typed(kind: Callable[[str], Any], text: str, requirement: str) -> Any:
     try:
-        return text if text == LEARNED else float(text)
+        return kind(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
+        raise argparse.ArgumentTypeError(f"is {text!r}; it must be {requirement}") from error
 
 
-_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
+def whole_number(text: str) -> int:
+    """What was typed, as the type of an option. Raises ArgumentTypeError."""
+    return _typed(int, text, KINDS[int])
+
+
+def number(text: str) -> float:
+    """What was typed, as the type of an option. Raises ArgumentTypeError."""
+    return _typed(float, text, KINDS[float])
+
+
+def _number_or_learned(text: str) -> Union[float, str]:
+    return text if text == LEARNED else _typed(float, text, f"{KINDS[float]} or `{LEARNED}`")
+
+
+_TYPES = {"int": whole_number, "float": number, "str": str, "Optional[str]": str,
+          "Union[float, str, None]": _number_or_learned}
 
 
 def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
@@ -56,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         keywords: Dict[str, Any] = {"type": kind, "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True
-        elif option.default is not None and defaults:
+        elif option.default not in (None, "") and defaults:
             text += f" (default: {option.metadata.get('typed_default', option.default)})"
         if option.metadata.get("choices"):
             keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])

@@ -76,10 +76,9 @@ def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any])
     given = {name: features[name].flatten(1) for name in names if features.get(name) is not None
              and features[name].dim() > 1}
     if given:
-        shs, colors = inputs.pop("shs", None), inputs.pop("colors_precomp", None)
-        if colors is None or colors.numel() == 0 and shs is not None:
-            colors = reference.color(reference.Gaussians(inputs["means3D"], None, None, shs, None, None, None, None),
-                                     settings)
+        shs, colors = reference.appearance(*(inputs.pop(name, None) for name in ("dc", "shs", "colors_precomp")))
+        colors = reference.color(reference.Gaussians(inputs["means3D"], None, None, shs, colors, None, None, None),
+                                 settings)
         inputs["colors_precomp"] = torch.cat([colors, *given.values()], 1)
         settings = settings._replace(bg=pad(settings.bg, (0, sum(rows.shape[1] for rows in given.values()))))
     found = _rendered([name for name in names if name not in features], settings, inputs)

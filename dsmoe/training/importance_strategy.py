@@ -25,7 +25,8 @@ REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
 MOVES_END = 4 / 3
 MOVE_INTERVAL = 1 / 30
 
-# The average begins behind 21,000. Between two of its terms are so many steps, fewer in the shortest runs.
+# The average begins behind 21,000. Between two of its terms are so many steps, fewer in the shortest runs, and at least
+# a batch.
 AVERAGE_BEGINS = 7 / 5
 MOST_BETWEEN_TERMS = 10
 TERMS = 100  # in densify_until_iter, at least, if that has so many steps
@@ -67,7 +68,7 @@ class ImportanceStrategy(SteadyStrategy):
         self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
                       if iteration > self.removals[-1] and self.options.moves > 0]
         self.average_begins = round(AVERAGE_BEGINS * until)
-        self.between_terms = max(1, min(MOST_BETWEEN_TERMS, until // TERMS))
+        self.between_terms = max(config.batch, min(MOST_BETWEEN_TERMS, until // TERMS))
         self.average_span = self.options.average * until  # steps
         self._looked: List[View] = []  # by the step in progress
         self._find_free_space()
@@ -130,9 +131,10 @@ class ImportanceStrategy(SteadyStrategy):
         elif any(map(step.reaches, self.moves)):
             self.move()
         behind, between = step.iteration - self.average_begins, self.between_terms
-        if self.average_span > 0 and behind // between > max(0, behind - step.batch) // between:
-            # At first all terms weigh about the same, as else the first one would weigh more than others to the end.
-            part = min(1.0, max(between, step.batch) / min(self.average_span, behind))
+        if self.average_span > 0 and behind >= between and is_due(behind, between, step.batch):
+            # At first all terms weigh the same, as else the first one would weigh more than others to the end.
+            terms = behind // between
+            part = min(1.0, between / min(self.average_span, terms * between))
             gate = self.context.render.background_gate
             self.context.optimizer.add_to_average(part, gate if isinstance(gate, torch.Tensor) else None)
 

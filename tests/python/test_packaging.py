@@ -285,7 +285,7 @@ def test_quickstart_builds_no_kernels_where_there_is_no_gpu_unless_asked(tmp_pat
 @pytest.mark.parametrize("words, status, error", [
     ("garden --iterations 10", 1, "error: scene garden: no such folder"),
     ("--iterations 10 -o out garden", 1, "error: scene garden: no such folder"),
-    ("--iterations abc", 2, "argument --iterations: invalid int value: 'abc'"),
+    ("--iterations abc", 2, "argument --iterations: is 'abc'; it must be a whole number"),
     ("--iterations 0", 1, "error: --iterations is 0; it must be at least 1"),
     ("--iterations", 2, "argument --iterations: expected one argument"),
     ("--strategy none", 2, "argument --strategy"), ("--itertions 10", 2, "unrecognized arguments: --itertions"),

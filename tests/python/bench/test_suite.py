@@ -107,7 +107,7 @@ def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
     ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "less than or equal to 1000000"]),
     ({"budgets": [3]}, ["budgets[0]", "0, which is none, or at least 4"]),
-    ({"strategies": ["importance"]}, ["--budget is 0", "--strategy importance"]),
+    ({"strategies": ["importance"]}, ["--strategy importance needs --budget"]),
     ({"protocol": {"options": {"strategy_options": "overshoot=2"}}},
      ["--strategy-options", "only importance has some"]),
     ({"seeds": 0}, ["seeds", "a valid list, such as [0]"]), ({"seeds": [1.0]}, ["seeds[0]", "1.0", "integer"]),

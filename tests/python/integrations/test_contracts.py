@@ -198,6 +198,22 @@ def test_features_are_blended_beside_the_colours(mode, module, name, shape, sett
         assert_close(found, expected, TOLERANCE, "an image or a gradient")
 
 
+def test_features_beside_colours_whose_first_coefficient_is_apart(mode):
+    """With a degree below that of the coefficients, too."""
+    scene, objects = scene_of(mode), random_normal((N, 1, 5), 87)
+    combined = SimpleNamespace(**dict(zip(NAMES, classes_of("color,radii,objects", __name__))))
+    shs = scene.inputs["shs"]
+    inputs = {name: tensor for name, tensor in scene.inputs.items() if name != "shs"}
+    for degree in (0, 1):
+        settings = combined.GaussianRasterizationSettings(**scene.settings._replace(sh_degree=degree)._asdict())
+        color, _, image = combined.GaussianRasterizer(settings)(
+            **inputs, dc=shs[:, :1], shs=shs[:, 1:], sh_objs=objects)
+        assert_close(color, own(scene.with_settings(sh_degree=degree)).color, TOLERANCE, f"colour at degree {degree}")
+        assert torch.equal(image, rendered(grouping, scene, sh_objs=objects)[2])
+    with pytest.raises(ValueError, match="give either shs or colors_precomp, and not both"):
+        rendered(grouping, scene, sh_objs=objects, colors_precomp=torch.zeros(N, 3).double())
+
+
 def test_features_that_are_not_wanted():
     scene = scene_of("smoe")
     assert not rendered(langsplat, scene, {"include_feature": False})[1].any()

@@ -151,6 +151,21 @@ def test_a_gate_is_resumed_on_its_own_device(tiny_config):
     assert not state["adam"]["exp_avg"].any(), "the state that it was given stays"
 
 
+@pytest.mark.parametrize("batch, ends", [(2, [46, 48, 52, 54, 58]), (5, [50, 55])])
+def test_the_first_terms_of_an_average_weigh_the_same_in_batches(tiny_config, scene, monkeypatch, batch, ends):
+    """A term is due behind step 42 of each three steps, and of each batch of more."""
+    monkeypatch.setattr("dsmoe.training.importance_strategy.TERMS", 10)
+    trainer = BatchTrainer(tiny_config.changed(strategy="importance", budget=60, iterations=60, batch=batch,
+                                               strategy_options="average=10"), scene, ALONE)
+    terms = []
+    while trainer.iteration < 60:
+        trainer.step()
+        if trainer.iteration in ends:
+            terms.append(trainer.model.raw["means3D"].detach().double())
+    average = trainer.optimizer.average["means3D"].double()
+    torch.testing.assert_close(average, sum(terms) / len(ends), rtol=1e-6, atol=1e-6)  # roundings of float32
+
+
 def test_training_lowers_the_loss(tiny_config, scene):
     trainer = BatchTrainer(tiny_config.changed(batch=4, iterations=120, densify_until_iter=0), scene, ALONE)
     losses = [float(trainer.step().loss) for _ in range(30)]

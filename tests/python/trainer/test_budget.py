@@ -486,8 +486,9 @@ def test_noise_shakes_the_faint_only(tiny_config):
 
 
 @pytest.mark.parametrize("options, words", [
-    (dict(strategy="importance"), "--budget is 0; it must be at least 4 with --strategy importance"),
-    (dict(strategy="mcmc"), "--budget is 0; it must be at least 4 with --strategy mcmc"),
+    (dict(strategy="importance"), "--strategy importance needs --budget, .* for example --budget 30000"),
+    (dict(strategy="mcmc"), "--strategy mcmc needs --budget, .* for example --budget 30000"),
+    (dict(budget=3), "--budget is 3; it must be at least 4 with --strategy importance"),
     (dict(budget=-1), "--budget is -1; it must be at least 0"),
     (dict(budget=100, densify_until_iter=1),
      "--densify-until-iter is 1; it must be at least 2 with --strategy importance"),

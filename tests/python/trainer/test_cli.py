@@ -136,6 +136,16 @@ def test_help_has_groups_and_a_wrong_mode_is_named_where_it_is_given(scene, caps
     assert "unrecognized arguments: --itertions 5 (is --iterations meant?)" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words, error", [
+    ("train s -o o --iterations 1e4", "argument --iterations: is '1e4'; it must be a whole number\n"),
+    ("train s -o o --opacity-lr 0,1", "argument --opacity-lr: is '0,1'; it must be a number\n"),
+    ("view o --port 80x", "argument --port: is '80x'; it must be a whole number\n")])
+def test_what_is_no_number_is_told(words, error, capsys):
+    with pytest.raises(SystemExit):
+        main(words.split())
+    assert capsys.readouterr().err.endswith(error)
+
+
 def test_eval_measures_the_same_again(trained, capsys):
     before, = results_of(trained)
     assert main(["eval", trained]) == 0
