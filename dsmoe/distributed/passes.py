@@ -81,3 +81,5 @@ class BatchPasses(Passes):
 
     def update(self) -> None:
         self.optimizer.step()
+        for tensor in self.model.stored.values():  # the next gradients are not there beside these
+            tensor.grad = None

@@ -10,20 +10,16 @@ from .graphs import PIXEL_BYTES
 # Adam, and what a densification copies. Others are activations, places on the image, statistics and tile lists. By
 # benchmarks/RESULTS.md 1.2 to 3.0 million Gaussians of degree 3 add 1,431 B each (bonsai, alpha) and 1,517 B (smoe).
 FOR_EACH_PARAMETER, OTHERS = 5, 65
-# In a batch also the gradients of one view beside their sum, and for each further view its footprints and gradients by
-# places. By benchmarks/results/distributed_*.jsonl 1,635 B with two views a step and 1,855 B with eight were the peak,
-# without a densification.
-FOR_EACH_PARAMETER_OF_A_BATCH, OF_A_FURTHER_VIEW = 1, 10
+# For each further view of a batch its rows, gradients by these and by places. By benchmarks/results/distributed_*.jsonl
+# one adds 64 B, with half of the Gaussians in sight.
+OF_A_FURTHER_VIEW = 16
 PARAMETERS_BESIDE_COLOR = 11  # mean, opacity, scales, rotation
 
 
 def gaussian_bytes(config: TrainConfig) -> int:
     """About how much memory a Gaussian takes at the peak of a training."""
     parameters = PARAMETERS_BESIDE_COLOR + 3 * (config.sh_degree + 1)**2
-    numbers = FOR_EACH_PARAMETER * parameters + OTHERS
-    if config.batch > 1:
-        numbers += FOR_EACH_PARAMETER_OF_A_BATCH * parameters + OF_A_FURTHER_VIEW * (config.batch - 1)
-    return 4 * numbers
+    return 4 * (FOR_EACH_PARAMETER * parameters + OTHERS + OF_A_FURTHER_VIEW * (config.batch - 1))
 
 
 def free_bytes(pixels: int) -> int:

@@ -108,7 +108,7 @@ class Strategy:
 
     Hooks run in this order in each step. Learning rates may be set in any, best in the first; rows may be added or
     removed in the last two (through the optimizer), which the last step of a run leaves out. The tensors of a step hold
-    until the next one. What is decided over all Gaussians is decided through `context.shards`, as a process may have
+    until its end. What is decided over all Gaussians is decided through `context.shards`, as a process may have
     only some of them.
     """
 

@@ -149,6 +149,8 @@ class Trainer:
                 if self.gate:
                     self.gate.step()
                 self.strategy.after_step(step)
+        for tensors in (step.seen, step.looks):
+            tensors.clear()  # of a batch they are large
         return step
 
     def _next_views(self) -> List[ViewOver]:
