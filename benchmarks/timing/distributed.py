@@ -47,7 +47,7 @@ def rows_of(packed: Dict[str, torch.Tensor], copies: int, begin: int, end: int) 
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def new_trainer(options: argparse.Namespace, group: Any) -> BatchTrainer:
+def new_trainer(options: argparse.Namespace, group: Any, batch: int, blend_mode: str) -> BatchTrainer:
     """A trainer of the model with all SH degrees active and a fixed number of Gaussians."""
     packed = np.load(options.npz)
     cameras = models.from_npz_cameras(packed)
@@ -55,8 +55,8 @@ def new_trainer(options: argparse.Namespace, group: Any) -> BatchTrainer:
     blank = torch.zeros(3, cameras[0].height, cameras[0].width, dtype=torch.uint8)
     points = PointCloud(np.random.RandomState(0).rand(max(4, group.size), 3), np.zeros((max(4, group.size), 3)))
     scene = Scene("synthetic", [View(camera, blank) for camera in cameras], [], points, 1.0, "all train")
-    config = TrainConfig(scene="-", output="-", device=options.device, batch=options.batch,
-                         blend_mode=options.blend_mode, iterations=10**6 * options.batch, densify_until_iter=0,
+    config = TrainConfig(scene="-", output="-", device=options.device, batch=batch,
+                         blend_mode=blend_mode, iterations=10**6 * batch, densify_until_iter=0,
                          sh_degree=options.sh_degree, deterministic=options.deterministic).validate()
     trainer = BatchTrainer(config, scene, group)
     tensors = {name: torch.tensor(packed[key], device=options.device) for name, key in (
@@ -99,12 +99,12 @@ def digest(trainer: BatchTrainer) -> Dict[str, str]:
     return {name: checksum.hexdigest()[:16] for name, checksum in sums.items()}
 
 
-def measure(options: argparse.Namespace, group: Any) -> Dict[str, Any]:
+def measure(options: argparse.Namespace, group: Any, batch: int, blend_mode: str) -> Dict[str, Any]:
     """The row of this number of processes."""
-    trainer = new_trainer(options, group)
+    trainer = new_trainer(options, group, batch, blend_mode)
     render_targets(trainer)
     row: Dict[str, Any] = {"model": options.name, "gaussians": trainer.num_gaussians, "sh_degree": options.sh_degree,
-                           "processes": group.size, "batch": options.batch, "blend_mode": options.blend_mode,
+                           "processes": group.size, "batch": batch, "blend_mode": blend_mode,
                            "deterministic": options.deterministic}
     if options.digest:
         seen: Dict[str, str] = {}
@@ -122,7 +122,7 @@ def measure(options: argparse.Namespace, group: Any) -> Dict[str, Any]:
     seconds = time.perf_counter() - started
     peak = torch.cuda.max_memory_allocated() if options.device == "cuda" else 0
     row.update(steps=options.steps, milliseconds=1000 * seconds / options.steps, loss=float(step.loss),
-               images_per_second=options.batch * options.steps / seconds,
+               images_per_second=batch * options.steps / seconds,
                peak_gib=[numbers[0] / 1024 for numbers in group.gather_numbers([peak >> 20], options.device)],
                machine=machine(options.device), versions=versions())
     return row
@@ -145,9 +145,9 @@ def main() -> None:
     parser.add_argument("--npz", required=True, help="a packed model")
     parser.add_argument("--name", default="model", help="of the model, in the row")
     parser.add_argument("--copies", type=int, default=1, help="of the model, that are trained together")
-    parser.add_argument("--batch", type=int, default=4, help="views a step")
+    parser.add_argument("--batch", type=int, nargs="+", default=[4], help="views a step; a row for each")
     parser.add_argument("--sh-degree", type=int, default=3)
-    parser.add_argument("--blend-mode", default="alpha")
+    parser.add_argument("--blend-mode", nargs="+", default=["alpha"], help="a row for each")
     parser.add_argument("--width", type=int, default=0, help="of the images (default: the model's)")
     parser.add_argument("--height", type=int, default=0)
     parser.add_argument("--warmup", type=int, default=5, help="steps before those that are timed")
@@ -158,12 +158,15 @@ def main() -> None:
     parser.add_argument("--json", help="file to which the row is added")
     options = parser.parse_args()
     group = join_group(options.device)
-    row = measure(options, group)
-    if group.leads:
-        print(json.dumps(row))
-        if options.json:
-            with open(options.json, "a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
+    for blend_mode in options.blend_mode:
+        for batch in options.batch:
+            row = measure(options, group, batch, blend_mode)
+            if not group.leads:
+                continue
+            print(json.dumps(row))
+            if options.json:
+                with open(options.json, "a", encoding="utf-8") as file:
+                    file.write(json.dumps(row) + "\n")
     leave_group(group)
 
 
