@@ -169,9 +169,8 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
-    if config.strategy == "importance" and 4 * config.densify_until_iter >= 3 * config.iterations:
-        print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
-              "quarters of --iterations it does, and --scale-recipe makes it half of them")
+    for note in config.notes():
+        print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
                 say=lambda text: print(text, flush=True))
     print(results_table([row]))
@@ -189,7 +188,7 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     if arguments.resume and set(given) & {"scene", "output"} == {"scene"}:  # dsmoe train --resume OUT
         given["output"] = arguments.output = given.pop("scene")
         del arguments.scene
-    if "output" not in given or "scene" not in given and not arguments.resume:
+    if not given.get("output") or not given.get("scene") and not arguments.resume:
         arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs only OUT")
     presets = ["--fast"] * arguments.fast + ["--scale-recipe"] * arguments.scale_recipe
     if arguments.resume and presets and "scene" not in given:

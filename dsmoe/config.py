@@ -177,8 +177,9 @@ class TrainConfig:
             self.importance_options()
             self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy importance; "
                           "--scale-recipe makes it half of --iterations")
-            self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter "
-                          "with --strategy importance, whose removals end there; --scale-recipe shortens all of it")
+            self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter, "
+                          f"{self.densify_until_iter}, with --strategy importance, whose removals end there; "
+                          "--scale-recipe shortens all of it")
         self._require("strategy_options", not self.strategy_options or self.strategy == "importance",
                       f"left out with --strategy {self.strategy}: only importance has some")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
@@ -245,6 +246,17 @@ class TrainConfig:
         usual = {**{option.name: option.default for option in dataclasses.fields(self)},
                  **_recipe_of(str(self.strategy))}
         return {name: getattr(self, name) for name in RECIPE if getattr(self, name) != usual[name]}
+
+    def notes(self) -> List[str]:
+        """What may surprise in a run with these options, in a line each."""
+        notes = []
+        if self.iterations <= self.densify_from_iter < self.densify_until_iter:
+            notes.append(f"--iterations {self.iterations} adds no Gaussians: that begins after step "
+                         f"{self.densify_from_iter}; --scale-recipe squeezes the recipe into so few")
+        if self.strategy == "importance" and 4 * self.densify_until_iter >= 3 * self.iterations:
+            notes.append(f"--densify-until-iter {self.densify_until_iter} leaves no iterations to settle; below three "
+                         "quarters of --iterations it does, and --scale-recipe makes it half of them")
+        return notes
 
     def shortened(self) -> TrainConfig:
         """The same recipe squeezed into `iterations` steps: each milestone keeps its share of the 30,000 of 3DGS.

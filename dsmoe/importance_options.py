@@ -21,7 +21,7 @@ class ImportanceOptions:
     # Growth ends at so many times the budget; 0: wherever the threshold leads.
     overshoot: float = _setting(10.0, lambda x: x == 0 or x >= 1, "0 or at least 1")
     # Steps down to the budget.
-    removals: int = _setting(16, lambda x: x >= 1, "at least 1")
+    removals: int = _setting(16, lambda x: 1 <= x <= 1000, "at least 1 and at most 1000")
     # Training views that a decision looks at.
     views: int = _setting(80, lambda x: x >= 1, "at least 1")
     # The most Gaussians that move at a time, as a part of all; 0: none.

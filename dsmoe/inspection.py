@@ -54,7 +54,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
         print(line)
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
-        raise TrainerError(f"scene {config.scene} has no {split} views")
+        raise TrainerError(f"scene {config.scene} has no {split} views; --split names others")
     masked = bool(earlier) and "masks" in earlier[0].get("protocol", {})
     if masked != any(view.mask is not None for view in views) and earlier:
         raise TrainerError(f"{config.scene} has {'no masks' if masked else 'masks'}, but the run was measured "
@@ -158,7 +158,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
         renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
     cameras = load_cameras(config, split)
     if not cameras:
-        raise TrainerError(f"scene {config.scene} has no {split} views")
+        raise TrainerError(f"scene {config.scene} has no {split} views; --split names others")
     return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs, overwrite)
 
 

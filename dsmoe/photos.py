@@ -63,12 +63,11 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
     MOST_EXHAUSTIVE. say: is called with a line before each step. Raises SceneError, also if the photographs do not
     connect, and TrainerError without pycolmap.
     """
-    _check_folder(photos)
+    names = photo_names(photos, output)
     try:
         import pycolmap
     except ImportError as error:
         raise TrainerError(f"dsmoe scene needs COLMAP's Python package: {pip_install('pycolmap')}") from error
-    names = photo_names(photos, output)
     own_record(output, SCENE, folders=WRITTEN)  # refused before anything is made
     make_folder(output)
     with only_one(output):

@@ -91,7 +91,7 @@ def read_layout(config: TrainConfig) -> Layout:
 
 
 def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
-    """What was loaded, in a line, or two if images were undistorted; layout: what the scene was loaded from."""
+    """What was loaded, in a line, and what is to be known of it, in further ones; layout: what it was loaded from."""
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
     size = " to ".join(f"{width}x{height}" for width, height in sizes[::max(1, len(sizes) - 1)])
     first, file_size = scene.train[0].camera, image_size(layout.train[0].path)
@@ -100,8 +100,12 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
         size += f" (scaled from {file_size[0]}x{file_size[1]} by --resolution {config.resolution}{why})"
     count, there = len(scene.points.positions), len(layout.points.positions)
     points = f"{count:,} points" if count == there else f"{count:,} of {there:,} points"
+    lines = [layout.warning, scene.note]
+    if config.batch > len(scene.train):
+        lines.append(f"note: a step of --batch {config.batch} shows some of the {len(scene.train)} training images "
+                     "more than once")
     return (f"{len(scene.train)} training and {len(scene.test)} test images ({scene.split}), {size} pixels, {points} "
-            "to start from" + "".join(f"\n{line}" for line in (layout.warning, scene.note) if line))
+            "to start from" + "".join(f"\n{line}" for line in lines if line))
 
 
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:

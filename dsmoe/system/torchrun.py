@@ -20,6 +20,9 @@ def chosen_gpus(asked: str, device: str, batch: int) -> int:
     """
     import torch
 
+    number = int(asked) if re.fullmatch(r"\d{1,9}", asked, re.ASCII) else 0
+    if number == 0 and asked != AUTO:
+        raise ConfigError(f"{GPUS} is {asked}; it must be {AUTO} or a whole number, at least 1")
     if device != "cuda":
         raise ConfigError(f"{GPUS} is {asked} with --device {device}; it needs --device cuda")
     there = torch.cuda.device_count()
@@ -27,10 +30,8 @@ def chosen_gpus(asked: str, device: str, batch: int) -> int:
         raise ConfigError(f"{GPUS} is {asked}, and torch finds no GPU here; on CPUs start torchrun with --device cpu")
     if asked == AUTO:
         return min(there, batch)
-    number = int(asked) if re.fullmatch(r"\d{1,9}", asked, re.ASCII) else 0
-    if not 1 <= number <= there:
-        raise ConfigError(f"{GPUS} is {asked}; it must be {AUTO}, or at least 1 and at most {there}: so many GPUs "
-                          "torch finds here")
+    if number > there:
+        raise ConfigError(f"{GPUS} is {asked}; it must be {AUTO}, or at most {there}: so many GPUs torch finds here")
     return number
 
 

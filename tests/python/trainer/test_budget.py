@@ -492,7 +492,7 @@ def test_noise_shakes_the_faint_only(tiny_config):
     (dict(budget=-1), "--budget is -1; it must be at least 0"),
     (dict(budget=100, densify_until_iter=1),
      "--densify-until-iter is 1; it must be at least 2 with --strategy importance"),
-    (dict(budget=100, iterations=7000), "--iterations is 7000; it must be at least --densify-until-iter"),
+    (dict(budget=100, iterations=7000), "--iterations is 7000; it must be at least --densify-until-iter, 15000, with"),
 ])
 def test_what_cannot_be_is_said(options, words):
     with pytest.raises(ConfigError, match=words):
@@ -502,7 +502,8 @@ def test_what_cannot_be_is_said(options, words):
 @pytest.mark.parametrize("text, words", [
     ("views=1.5", "views is '1.5'; it must be a whole number, at least 1"), ("speed=1", "'speed' is unknown"),
     ("moves=x", "moves is 'x'; it must be a finite number, between 0 and 1"), ("views", "views is ''"),
-    ("removals=0", "removals is 0; it must be at least 1"), ("views=0", "views is 0; it must be at least 1"),
+    ("removals=0", "removals is 0; it must be at least 1 and at most 1000"), ("removals=1001", "removals is 1001; it"),
+    ("views=0", "views is 0; it must be at least 1"),
     ("moves=2", "moves is 2; it must be between 0 and 1"),
     ("moves=nan", "moves is 'nan'; it must be a finite number, between 0 and 1"),
     ("overshoot=0.5", "overshoot is 0.5; it must be 0 or at least 1"),

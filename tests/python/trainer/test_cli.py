@@ -101,6 +101,8 @@ def test_training_says_what_it_loaded_and_what_comes_next(scene, tmp_path, capsy
     text = capsys.readouterr().out
     assert "9 training and 0 test images (no image is kept for testing), 32x24 pixels" in text
     assert "nothing was measured" in text
+    for command in (["eval", output], ["render", output, "-o", output + "_images"]):
+        assert "has no test views; --split names others" in fails(capsys, *command)
     assert "--test-every is 1; it must be 0 or at least 2" in fails(capsys, "train", scene, "-o", output,
                                                                     "--test-every", "1")
 
@@ -565,6 +567,9 @@ def test_resume_of_a_folder_alone_has_the_options_of_the_run(trained, tmp_path, 
     assert "no such folder" in fails(capsys, "train", *words, str(tmp_path / "none"))
     with pytest.raises(SystemExit):
         main(["train", "-o", output])
+    assert "SCENE and -o OUT are needed" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["train", "scene", "-o", ""])  # as of a shell's variable that is not set
     assert "SCENE and -o OUT are needed" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["train", "--resume", output, "--scale-recipe"])

@@ -216,6 +216,16 @@ def test_differences_ignore_where_and_when_things_are_written():
     assert len(texts) == 3 and any("--seed is 1, not 2" in text for text in texts)
 
 
+@pytest.mark.parametrize("options, words", [
+    (dict(iterations=500), ["--iterations 500 adds no Gaussians: that begins after step 500; --scale-recipe"]),
+    (dict(iterations=501), []), (dict(iterations=500, densify_until_iter=0), []),
+    (dict(iterations=20_000, budget=100), ["--densify-until-iter 15000 leaves no iterations to settle"]),
+    (dict(iterations=20_001, budget=100), [])])
+def test_what_may_surprise_is_noted(options, words):
+    notes = TrainConfig(**options).notes()
+    assert len(notes) == len(words) and all(note.startswith(word) for note, word in zip(notes, words))
+
+
 def test_shortened_keeps_the_shares_of_the_recipe():
     assert TrainConfig(iterations=30_000).shortened() == TrainConfig(iterations=30_000)
     short = TrainConfig(iterations=3000).shortened()

@@ -235,9 +235,11 @@ def test_processes_that_do_not_meet_say_so(monkeypatch, capsys):
 
 def test_more_gpus_than_there_are_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    for asked in ("3", "0", "-1", "all"):
-        with pytest.raises(TrainerError, match=f"--gpus is {asked}; it must be auto, or at least 1 and at most 2"):
-            torchrun_module.chosen_gpus(asked, "cuda", 4)
+    with pytest.raises(TrainerError, match="--gpus is 3; it must be auto, or at most 2: so many GPUs torch finds"):
+        torchrun_module.chosen_gpus("3", "cuda", 4)
+    for asked, device in (("0", "cuda"), ("-1", "cpu"), ("all", "cuda")):
+        with pytest.raises(TrainerError, match=f"--gpus is {asked}; it must be auto or a whole number, at least 1"):
+            torchrun_module.chosen_gpus(asked, device, 4)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     for asked in ("3", "auto"):
         with pytest.raises(TrainerError, match="torch finds no GPU here; on CPUs start torchrun with --device cpu"):

@@ -147,7 +147,6 @@ def test_an_interrupted_command_says_that_it_continues(tmp_path, capsys, monkeyp
 def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)  # it is asked for later
     assert "nowhere: no such folder of photographs" in fails(capsys, tmp_path / "nowhere", "-o", tmp_path / "scene")
-    monkeypatch.setitem(sys.modules, "pycolmap", sys)
     (tmp_path / "walk.mp4").write_text("")
     assert "ffmpeg -i VIDEO" in fails(capsys, tmp_path / "walk.mp4", "-o", tmp_path / "scene")
     (tmp_path / "1.jpg").write_text("")
@@ -161,6 +160,7 @@ def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     (tmp_path / "IMG_1.HEIC").write_text("")
     text = fails(capsys, tmp_path, "-o", tmp_path / "scene")
     assert "0 photographs" in text and "at least 3" in text and "IMG_1.HEIC is of a kind that COLMAP does not" in text
+    monkeypatch.setitem(sys.modules, "pycolmap", sys)
     for index in range(3):
         Image.new("RGB", (8, 8)).save(tmp_path / f"{index}.JPG")
     (tmp_path / "mine").mkdir()

@@ -164,6 +164,10 @@ def test_several_cameras_and_sizes(colmap_folder):
     assert {view.camera.name: (view.camera.width, view.camera.fx) for view in scene.train + scene.test} == {
         image.name: (48, 50.0) if image.camera_id == 2 else (32, 28.8) for image in images}
     assert "32x24 to 48x30 pixels" in describe_scene(scene, read_layout(config), config)
+    count = len(scene.train)
+    for batch, note in ((count, ""), (count + 1, f"\nnote: a step of --batch {count + 1} shows some of the {count} ")):
+        said = describe_scene(scene, read_layout(config), dataclasses.replace(config, batch=batch))
+        assert ("note: " in said) == bool(note) and note in said
     trainer = Trainer(config, scene)
     for _ in range(7):  # each view once
         trainer.step()
