@@ -45,7 +45,8 @@ const std::string kRadii = "radii(" + kInputs + without_comma(kOptions) + ") -> 
 
 // The two halves of rasterize, with the footprints of N Gaussians between them: what the blend reads of each. gates:
 // [N, 8], `projected` of params.h; features: [N, F], the colour's channels, then z and 1 / z where the options ask for
-// them; radii: [N]. The blend also takes features whose rows are filled up to a multiple of four. Footprints of equal depth are blended in their order.
+// them; radii: [N]. The blend also takes features whose rows are filled up to a multiple of four. Footprints of equal
+// depth are blended in their order.
 const std::string kProject =
     "project(" + kInputs + without_comma(kOptions) + ") -> (Tensor gates, Tensor features, Tensor radii)";
 const std::string kBlend = "blend(Tensor gates, Tensor features, Tensor radii, Tensor bg, Tensor? background_gate, " +
@@ -71,8 +72,8 @@ const std::string kBatch = kInputs + kOptions + "Tensor[] cameras, float[] image
 const std::string kCountRows = "count_rows(" + kBatch + ") -> (Tensor radii, Tensor offsets)";
 
 // Fills gates [M, 8] and features [M, 4] of each view.
-const std::string kProjectRows = "project_rows(" + kBatch +
-                                 ", Tensor(a!) radii, Tensor offsets, Tensor(b!)[] gates, Tensor(c!)[] features) -> ()";
+const std::string kProjectRows =
+    "project_rows(" + kBatch + ", Tensor(a!) radii, Tensor offsets, Tensor(b!)[] gates, Tensor(c!)[] features) -> ()";
 
 // records: [M, 9] of each view. dL_dmeans2D: [V, N, 3], written where the radius is above 0. gradients: those by the
 // Gaussians that the arguments hold, but for means2D, in their order, summed over the views.
