@@ -10,6 +10,7 @@ has checksums of the gradients, which with --deterministic are the same for any 
 from __future__ import annotations
 
 import argparse
+import gc
 import hashlib
 import json
 import math
@@ -161,6 +162,7 @@ def main() -> None:
     for blend_mode in options.blend_mode:
         for batch in options.batch:
             row = measure(options, group, batch, blend_mode)
+            gc.collect()  # the trainer refers to itself, and the next one's peak is without it
             if not group.leads:
                 continue
             print(json.dumps(row))

@@ -120,6 +120,8 @@ class Batch:
         found: Dict[int, Look] = {}
         for views in self.rounds:
             some = {rank: view for rank, view in views.items() if view in wanted}
+            if not some:
+                continue
             look = own.get(some[self.group.rank]) if self.group.rank in some else None
             rows = None if look is None else torch.stack(look, 1)
             returned = self._begin_return(some, rows, len(Look._fields))()
