@@ -10,7 +10,7 @@ from .graphs import PIXEL_BYTES
 # Adam, and what a densification copies. Others are activations, places on the image, statistics and tile lists. By
 # benchmarks/RESULTS.md 1.2 to 3.0 million Gaussians of degree 3 add 1,431 B each (bonsai, alpha) and 1,517 B (smoe).
 FOR_EACH_PARAMETER, OTHERS = 5, 65
-# For each further view of a batch its rows, gradients by these and by places: 64 B, with half of the Gaussians in sight.
+# For each further view of a batch its rows, gradients by these and by places: 64 B if half of the Gaussians are seen.
 OF_A_FURTHER_VIEW = 16
 PARAMETERS_BESIDE_COLOR = 11  # mean, opacity, scales, rotation
 

@@ -123,7 +123,7 @@ def test_a_gaussian_takes_what_was_measured():
     for few, many in (((1_199_000, 2034), (3_012_000, 4508)), ((928_000, 1841), (2_364_000, 3918))):
         measured = (many[1] - few[1]) * 2**20 / (many[0] - few[0])
         assert gaussian_bytes(TrainConfig()) == pytest.approx(measured, rel=0.1)
-    # benchmarks/results/distributed_h100.jsonl, batches of four: the peak of one of so many processes. Not measured, and
+    # benchmarks/results/distributed_h100.jsonl, batches of four: the peak of one of so many processes. Not measured and
     # up to a third more: a densification, which has the harmonics with both moments twice.
     for processes, gaussians, gib in ((1, 5_550_640, 6.207), (4, 99_911_520, 28.24)):
         measured = gib * 2**30 / (gaussians / processes)
