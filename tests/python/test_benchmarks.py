@@ -155,6 +155,7 @@ def test_the_tables_of_the_pages_are_those_of_the_rows():
     rows = tables.trainings()
     for page, text in (("../README.md", tables.readme_table(rows)), ("RESULTS.md", tables.budget_table(rows)),
                        ("RESULTS.md", tables.recipe_table(rows)), ("RESULTS.md", tables.race_table()),
+                       ("RESULTS.md", tables.numbers_table(rows)),
                        ("NOTES.md", tables.rules_table())):
         with open(os.path.join(BENCHMARKS, page), encoding="utf-8") as file:
             assert text in file.read(), f"{page}: `python benchmarks/tables.py` prints another table:\n{text}"
