@@ -12,7 +12,15 @@ from .extension import BACKENDS  # noqa: F401  (loading it registers the ops)
 _OPS = torch.ops.diff_smoe_rasterization
 
 
-class FusedAdam(torch.optim.Adam):
+class _Adam(torch.optim.Adam):
+    """torch.optim.Adam that does not import torch._dynamo when it is made: that takes seconds."""
+
+    def add_param_group(self, param_group: Dict[str, Any]) -> None:
+        add = torch.optim.Adam.add_param_group
+        getattr(add, "__wrapped__", add)(self, param_group)  # the decorator around it keeps it out of compiled graphs
+
+
+class FusedAdam(_Adam):
     """Adam as torch.optim.Adam computes it, but for rounding: one kernel launch a step for each precision and device.
 
     Groups and state are torch.optim.Adam's but for state["step"], an int here. Each takes the state_dict() of the
@@ -63,7 +71,7 @@ def corrected_rates(group: Dict[str, Any], step: int) -> Tuple[float, float]:
     return group["lr"] / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
 
 
-class SparseGaussianAdam(torch.optim.Adam):
+class SparseGaussianAdam(_Adam):
     """Adam that steps only the Gaussians that a view saw; the call of the 3DGS (2024) and Taming trainers.
 
     The moments are not corrected for their start at zero, the betas are 0.9 and 0.999, and the rows of Gaussians that

@@ -1,7 +1,7 @@
 """The footprints of some Gaussians in several views, row behind row, and the gradients back. The ops are the core's."""
 from __future__ import annotations
 
-from typing import Dict, List, Optional, Sequence, Tuple
+from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
 
 import torch
 
@@ -75,7 +75,7 @@ class ViewRows:
         assert sums is not None
         return dict(zip(names, sums)), means2D
 
-    def _parts(self):
+    def _parts(self) -> Iterator[Tuple[Tuple[Any, ...], torch.Tensor, torch.Tensor, slice]]:
         """The arguments of the ops for as many views as they take at once, and which these are."""
         begin = 0
         for arguments, radii, offsets in zip(self._arguments, self._radii, self._offsets):

@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -303,3 +305,11 @@ def test_a_learning_rate_may_be_a_tensor(device):
         set_gradients([parameter], 0)
         FusedAdam([parameter], lr=rate).step()
     assert torch.equal(first, second) and float(first.detach()[0]) != 1
+
+
+def test_no_compiler_is_loaded_to_make_an_optimizer():
+    """torch's own loads torch._dynamo, with every first training: 2 s here."""
+    program = ("import sys, torch; from diff_smoe_rasterization import FusedAdam, SparseGaussianAdam; "
+               "FusedAdam([torch.zeros(1)]), SparseGaussianAdam([{'params': [torch.zeros(1, 1)]}], 0.1, 1e-8); "
+               "sys.exit('torch._dynamo' in sys.modules)")
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
