@@ -246,6 +246,7 @@ def test_a_gradient_by_the_reach_reaches_what_the_opacity_is_made_of(options):
 
 @pytest.mark.parametrize("change, error, text", [
     (dict(features=slice(0, 2)), ValueError, r"features has shape \[120, 2\]; it must be \[120, 3\]"),
+    (dict(features=[0, 1, 2, 2]), ValueError, r"features has shape \[120, 4\]; it must be \[120, 3\]"),
     (dict(radii=torch.float32), TypeError, "radii is float32"),
     (dict(gates=slice(0, 7)), ValueError, r"gates has shape \[120, 7\]; it must be \[N, 8\]")])
 def test_footprints_that_do_not_fit_are_refused(change, error, text):
