@@ -143,6 +143,7 @@ def test_views_of_a_batch_without_rows_or_gaussians():
     (dict(images=[1.0]), "cameras and images have lengths 3 and 1; they must have 3 tensors and 4 numbers a view"),
     (dict(covariance="cov3D"), "cov3D_precomp is given; rows are of scales and rotations"),
     (dict(channels=3), "colors_precomp is given; rows are of shs or dc"),
+    (dict(channels=5), "num_channels is 5; rows have 3"),
     (dict(dtype=torch.float64), "means3D is float64; it must be float32"),
     (dict(depth=True), "config asks for depths; rows have colours alone")])
 def test_rows_refuse_what_they_do_not_hold(change, message):
