@@ -135,6 +135,7 @@ def test_views_of_a_batch_without_rows_or_gaussians():
         gates, features = rows.project([0, 0], [0, 1])
         assert gates.shape == (0, 8) and features.shape == (0, 4)
         gradients, _ = rows.backward([gates.new_zeros(0, 9)] * 2)
+        assert set(gradients) == set(inputs)
         for name, gradient in gradients.items():
             assert gradient.shape == inputs[name].shape and not gradient.any()
 
