@@ -17,7 +17,7 @@ from .arguments import as_rendering, op_arguments, op_options, tensor_checks
 from .autograd import INPUTS, OPTIONS, once_differentiable, refuse_transforms
 from .core import _core
 from .learned_gate import gate_of
-from .settings import BLEND_MODES, GaussianRasterizationSettings, Rendering, resolve_blend
+from .settings import BLEND_MODES, FEATURE_OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
 _GATE_NUMBERS = 8  # centre (2), conic (3), opacity, squared reach, depth
@@ -119,6 +119,10 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
     """
     tensors, options = blend_op_arguments(footprints, settings, outputs)
     refuse_transforms("blend_footprints", tensors)
+    shape = list(footprints.features.shape)
+    columns = settings.bg.numel() + sum(name in outputs for name in FEATURE_OUTPUTS)
+    if len(shape) == 2 and shape[1] > columns:  # the op may take such rows, and leave out what they are filled up with
+        raise ValueError(f"blend_footprints: features has shape {shape}; it must be {[shape[0], columns]}")
     if _wants_gradient(tensors):
         images = _Blend.apply((*options, True), *tensors)
     else:

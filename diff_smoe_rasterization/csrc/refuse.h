@@ -156,12 +156,13 @@ template <class Frame> void refuse_radii(const char* function, const Frame& fram
   refuse_null(function, "images.radii", frame.images.radii, "[N]", frame.inputs.num_gaussians);
 }
 
-// A batch of views that is not as its struct says. Frame: that of the backend. What a stage reads and writes of the
-// views: refuse(view).
+// A batch of views that is not as its struct says. Frame: that of the backend. refuse_view(view): refuses what a stage
+// cannot read or write of a view.
 template <class Frame, class Batch, class Refuse>
 void refuse_batch(const char* function, const Batch& batch, const Refuse& refuse_view) {
   const int64_t count = static_cast<int64_t>(batch.views.size());
   if (count < 1 || count > kMostViews) refuse(function, "views has length ", count, "; it must be 1 to ", kMostViews);
+  if (batch.config.num_channels != 3) refuse(function, "num_channels is ", batch.config.num_channels, "; rows have 3");
   if (batch.config.num_features() != 3) refuse(function, "config asks for depths; rows have colours alone");
   Frame frame;
   frame.inputs = batch.inputs, frame.config = batch.config;
@@ -182,10 +183,22 @@ void refuse_batch(const char* function, const Batch& batch, const Refuse& refuse
   }
 }
 
-// The same for a stage that reads or writes rows.
+// The same for a stage that reads or writes rows. A device takes these as vectors.
 template <class Frame, class Batch> void refuse_rows(const char* function, const Batch& batch, bool backward) {
+  const auto refuse_unaligned = [&](const char* name, const float* rows) {
+    if (kOnHost<Frame> || reinterpret_cast<std::uintptr_t>(rows) % 16 == 0) return;
+    refuse(function, name, " is not aligned; it must begin at a multiple of 16 bytes");
+  };
   refuse_batch<Frame>(function, batch, [&](const auto& view) {
     if (view.num_rows < 0) refuse(function, "num_rows is ", view.num_rows, "; it must be 0 or more");
+    if constexpr (kOnHost<Frame>) {
+      const int64_t counted = view.offsets[num_view_blocks(batch.inputs.num_gaussians)];
+      if (view.num_rows != counted) {
+        refuse(function, "num_rows is ", view.num_rows, "; it must be ", counted, ", the last of offsets");
+      }
+    }
+    refuse_unaligned("features", view.features);
+    if (!backward) refuse_unaligned("gates", view.gates);
     if (!backward) refuse_null(function, "gates", view.gates, "[M, 8]", view.num_rows);
     refuse_null(function, "features", view.features, "[M, 4]", view.num_rows);
     if (backward) refuse_null(function, "records", view.records, "[M, 9]", view.num_rows);

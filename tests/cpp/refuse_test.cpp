@@ -206,6 +206,34 @@ TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
   }
 }
 
+TEST(Refuse, RowsOfABatchFitWhatWasCounted) {
+  const Scene<float> scene = convert<float>(make_scene(1, 20, 37, 29));
+  std::vector<int32_t> radii(scene.count), offsets(2);
+  cpu::ViewBatch batch;
+  batch.inputs = scene.inputs(), batch.config = scene.raster_config();
+  auto& view = batch.views.emplace_back();
+  view.camera = scene.camera, view.radii = radii.data(), view.offsets = offsets.data();
+  cpu::count_rows(batch);
+  ASSERT_GT(offsets[1], 1);
+  alignas(16) float gates[20 * kProjectedGaussianSize], features[20 * kRowFeatures + 1];
+  view.gates = gates, view.features = features, view.num_rows = offsets[1] - 1;
+  const std::string message = "num_rows is " + std::to_string(view.num_rows) + "; it must be " +
+                              std::to_string(offsets[1]) + ", the last of offsets";
+  expect_refusal([&] { cpu::project_rows(batch); }, "cpu::project_rows: " + message);
+  expect_refusal([&] { cpu::project_rows_backward(batch, {}); }, "cpu::project_rows_backward: " + message);
+
+  cuda::ViewBatch on_device;
+  on_device.inputs = batch.inputs, on_device.config = batch.config;
+  auto& rows = on_device.views.emplace_back();
+  rows.camera = {37, 29, 0.6f, 0.6f, 0.2f, scene.camera.view, scene.camera.projection, scene.camera.position};
+  rows.radii = radii.data(), rows.offsets = offsets.data(), rows.num_rows = 7;  // the host does not read offsets there
+  rows.gates = gates, rows.features = features;
+  EXPECT_NO_THROW(refuse_rows<cuda::Frame<float>>("cuda::project_rows", on_device, false));
+  rows.features = features + 1;
+  expect_refusal([&] { refuse_rows<cuda::Frame<float>>("cuda::project_rows", on_device, false); },
+                 "cuda::project_rows: features is not aligned; it must begin at a multiple of 16 bytes");
+}
+
 TEST(Refuse, WhatMayBeNullIsNotRefused) {
   Scene<float> scene = convert<float>(make_scene(2, 20, 37, 29));
   Rendering<float> rendering(scene);

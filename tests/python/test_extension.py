@@ -351,7 +351,7 @@ def every_call():
     belongs = [here and name not in ("bg", "background_gate") for name, here in zip(_core.inputs, inputs["present"])]
     camera = [scene.settings.viewmatrix, scene.settings.projmatrix, scene.settings.campos]
     view = {"cameras": camera, "images": [20.0, 18.0, 1.0, 1.0], "depth": False, "inverse_depth": False}
-    counted = {"radii": torch.zeros(1, 20, dtype=torch.int32), "offsets": torch.zeros(1, 2, dtype=torch.int32)}
+    counted = {"radii": torch.zeros(1, 20, dtype=torch.int32), "offsets": torch.tensor([[0, 1]], dtype=torch.int32)}
     wide = torch.zeros(1, 4)
     depth = random_normal((20,), 1, torch.float32)
     raw = [random_normal((20, columns), columns, torch.float32) for columns in (3, 1, 3, 4)]

@@ -135,6 +135,7 @@ def test_views_of_a_batch_without_rows_or_gaussians():
         gates, features = rows.project([0, 0], [0, 1])
         assert gates.shape == (0, 8) and features.shape == (0, 4)
         gradients, _ = rows.backward([gates.new_zeros(0, 9)] * 2)
+        assert set(gradients) == set(inputs)
         for name, gradient in gradients.items():
             assert gradient.shape == inputs[name].shape and not gradient.any()
 
@@ -143,6 +144,7 @@ def test_views_of_a_batch_without_rows_or_gaussians():
     (dict(images=[1.0]), "cameras and images have lengths 3 and 1; they must have 3 tensors and 4 numbers a view"),
     (dict(covariance="cov3D"), "cov3D_precomp is given; rows are of scales and rotations"),
     (dict(channels=3), "colors_precomp is given; rows are of shs or dc"),
+    (dict(channels=5), "num_channels is 5; rows have 3"),
     (dict(dtype=torch.float64), "means3D is float64; it must be float32"),
     (dict(depth=True), "config asks for depths; rows have colours alone")])
 def test_rows_refuse_what_they_do_not_hold(change, message):
@@ -246,6 +248,7 @@ def test_a_gradient_by_the_reach_reaches_what_the_opacity_is_made_of(options):
 
 @pytest.mark.parametrize("change, error, text", [
     (dict(features=slice(0, 2)), ValueError, r"features has shape \[120, 2\]; it must be \[120, 3\]"),
+    (dict(features=[0, 1, 2, 2]), ValueError, r"features has shape \[120, 4\]; it must be \[120, 3\]"),
     (dict(radii=torch.float32), TypeError, "radii is float32"),
     (dict(gates=slice(0, 7)), ValueError, r"gates has shape \[120, 7\]; it must be \[N, 8\]")])
 def test_footprints_that_do_not_fit_are_refused(change, error, text):

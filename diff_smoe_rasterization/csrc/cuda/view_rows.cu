@@ -157,9 +157,11 @@ __global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_c
     int32_t radius = of_views.radius(v);
     const int64_t row = of_views.row(v, radius);
     if (row < 0) continue;
-    auto projected = project(gaussian, cameras[v], config.projection_rules()).gaussian;
+    auto [radius_again, projected] = project(gaussian, cameras[v], config.projection_rules());
     float features[kFastFeatures] = {};
-    if (!write_features<float>({colors_in(rows, inputs, own, dc), gaussian.mean, cameras[v], config}, projected.depth,
+    // Rounding may differ from that of the kernel that counted: then the Gaussian is culled only here.
+    if (radius_again == 0 ||
+        !write_features<float>({colors_in(rows, inputs, own, dc), gaussian.mean, cameras[v], config}, projected.depth,
                                features)) {
       radius = 0, projected = {};
       features[0] = features[1] = features[2] = 0;

@@ -243,7 +243,7 @@ template <class BackendCamera> struct BatchView {
   int32_t* radii = nullptr;        // [N] pixels; 0 if the Gaussian has no row
   int32_t* offsets = nullptr;      // [num_view_blocks(N) + 1] first row of each block; the last entry: how many rows
   int64_t num_rows = 0;            // M, as the caller has read it there
-  float* gates = nullptr;          // [M, kProjectedGaussianSize]
+  float* gates = nullptr;          // [M, kProjectedGaussianSize]; on a device 16-byte aligned, as are the features
   float* features = nullptr;       // [M, kRowFeatures]
   const float* records = nullptr;  // [M, kNumGateGradients + 3] as FootprintGradients has them
   float* means2D = nullptr;        // [N, 3] gradients, written where the radius is above 0

@@ -459,6 +459,16 @@ TEST(Kernels, TakeTheViewsOfABatchAsTheCpu) {
     if (of.count > 0) (of.dc.empty() ? of.shs : of.dc)[3 * 40] = NAN;  // that Gaussian has a row, and is culled
     const Scene<float> scene = convert<float>(of);
     const BatchResults expected = batch_on_cpu(scene), actual = batch_by_kernels(scene);
+    for (const auto order : {emulator::Order::kBackward, emulator::Order::kShuffled}) {
+      emulator::run_in(order);
+      const BatchResults other = batch_by_kernels(scene);
+      EXPECT_EQ(other.offsets, actual.offsets);
+      EXPECT_EQ(other.features, actual.features);
+      EXPECT_EQ(other.gates, actual.gates);
+      EXPECT_EQ(other.gradient.by.shs, actual.gradient.by.shs);
+      EXPECT_EQ(other.gradient.by.means3D, actual.gradient.by.means3D);
+    }
+    emulator::run_in(emulator::Order::kForward);
     for (size_t v = 0; v < actual.cameras.size(); ++v) {
       EXPECT_EQ(actual.radii[v], expected.radii[v]);
       EXPECT_EQ(actual.offsets[v], expected.offsets[v]);
