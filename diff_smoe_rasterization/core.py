@@ -15,7 +15,8 @@ def _load() -> Any:
         if error.name != f"{__package__}._core":
             raise
         folder = os.path.dirname(os.path.abspath(__file__))
-        fail(f"its extension _core is not built for this Python in {folder}; {BUILD}", error)
+        fail(f"its extension _core is not built for this Python in {folder}; if that is the source of one that is "
+             f"installed, go to another folder; to build it there, {BUILD}", error)
     except ImportError as error:
         fail(f"its extension _core does not load ({error}); build it again, {BUILD}", error)
 

@@ -12,6 +12,10 @@ from .children import die_with_parent
 
 GPUS, AUTO = "--gpus", "auto"
 
+PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # the folder that has dsmoe
+# What each process runs: this package, where `-m dsmoe` would take a dsmoe of the current folder, such as its source.
+PROCESS = "import sys; sys.path.insert(0, sys.argv.pop(1)); from dsmoe.cli import main; sys.exit(main())"
+
 
 def chosen_gpus(asked: str, device: str, batch: int) -> int:
     """How many GPUs of this machine a training takes. asked: a number, or `auto`: all, but no more than --batch.
@@ -50,8 +54,8 @@ def without_gpus(words: Sequence[str]) -> List[str]:
 
 def torchrun_command(gpus: int, words: Sequence[str]) -> List[str]:
     """What starts a `dsmoe` command, given by its words, in so many processes of this machine."""
-    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(gpus), "-m",
-            __name__.split(".")[0], *words]
+    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(gpus), "--no_python",
+            sys.executable, "-u", "-c", PROCESS, PACKAGE, *words]
 
 
 def launch(gpus: int, words: Sequence[str]) -> int:
@@ -59,9 +63,7 @@ def launch(gpus: int, words: Sequence[str]) -> int:
 
     If this process is killed, torchrun gets a SIGTERM, which it passes on: the processes save a checkpoint and end.
     """
-    package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)
-    environment = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path}
+    environment = {"OMP_NUM_THREADS": "1", **os.environ}
     process = subprocess.Popen(torchrun_command(gpus, words), env=environment, preexec_fn=die_with_parent)
     while True:
         try:

@@ -176,9 +176,18 @@ def test_gpus_starts_torchrun_with_the_same_command(tiny_config, monkeypatch):
     words = ["train", tiny_config.scene, "-o", tiny_config.output, "--batch", "4"]
     assert main([*words, "--gpus", "2"]) == 3 and main([*words[:2], "--gpus=2", *words[2:], "--device", "cuda"]) == 3
     assert seen == [(2, [*words, "--device", "cuda"])] * 2
-    command = torchrun_module.torchrun_command(2, words)
-    assert command[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    assert command[6:] == ["-m", "dsmoe", *words]
+
+
+@needs_gloo
+@needs_torchrun
+def test_gpus_starts_this_package_not_one_of_the_current_folder(tmp_path):
+    """As in the source folder of a package that is installed."""
+    (tmp_path / "dsmoe").mkdir()
+    (tmp_path / "dsmoe" / "__init__.py").write_text("raise SystemExit('the current folder')")
+    command = torchrun_module.torchrun_command(2, ["train", "nothing here", "-o", "out", "--device", "cpu"])
+    run = subprocess.run(command, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE,
+                         stderr=subprocess.STDOUT, universal_newlines=True, timeout=120)
+    assert run.stdout.count("nothing here") >= 1 and "the current folder" not in run.stdout, run.stdout
 
 
 TORCHRUN = {"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
