@@ -44,13 +44,13 @@ class RowsOfViews {
     for (int v = 0; v < arguments.num_views; ++v) {
       const int32_t own = radius(v);
       const unsigned all = __ballot_sync(kAllLanes, own != 0);
-      seen_ |= own > 0;
+      has_row_ |= own != 0;
       if (lane == 0) counts[v * kViewWarps + warp] = __popc(all);
     }
   }
 
-  // Whether a view sees the Gaussian.
-  __device__ bool seen() const { return seen_; }
+  // Whether the Gaussian has a row in a view.
+  __device__ bool has_row() const { return has_row_; }
 
   __device__ int32_t radius(int v) const { return exists_ ? arguments_.views[v].radii[i_] : 0; }
 
@@ -69,7 +69,7 @@ class RowsOfViews {
   const int64_t i_;
   const bool exists_;
   const int* counts_;
-  bool seen_ = false;
+  bool has_row_ = false;
 };
 
 __global__ void __launch_bounds__(kViewBlock) count_rows_kernel(const __grid_constant__ BatchArguments arguments) {
@@ -142,7 +142,7 @@ __global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_c
   const RowsOfViews of_views(arguments, i, counts);
   const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length, exist, lane);
   if constexpr (Rows::kStaged) {
-    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.seen()));
+    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.has_row()));
     wait_for_copies();
   }
   __syncthreads();
@@ -189,7 +189,7 @@ __global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlock
   const RowsOfViews of_views(arguments, i, counts);
   const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length, exist, lane);
   if constexpr (Rows::kStaged) {
-    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.seen()));
+    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.has_row()));
     wait_for_copies();
   }
   __syncthreads();

@@ -307,9 +307,9 @@ def test_a_learning_rate_may_be_a_tensor(device):
     assert torch.equal(first, second) and float(first.detach()[0]) != 1
 
 
-def test_no_compiler_is_loaded_to_make_an_optimizer():
+def test_no_compiler_is_loaded_to_make_an_optimizer(tmp_path):
     """torch's own loads torch._dynamo, with every first training: 2 s here."""
     program = ("import sys, torch; from diff_smoe_rasterization import FusedAdam, SparseGaussianAdam; "
                "FusedAdam([torch.zeros(1)]), SparseGaussianAdam([{'params': [torch.zeros(1, 1)]}], 0.1, 1e-8); "
                "sys.exit('torch._dynamo' in sys.modules)")
-    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
+    assert subprocess.run([sys.executable, "-c", program], cwd=tmp_path).returncode == 0
