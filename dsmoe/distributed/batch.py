@@ -73,7 +73,6 @@ class Batch:
         self.notes = list(notes)
         self._counts: List[Sequence[int]] = counts  # [view][process] how many rows
         self.rounds = rounds_of([sum(of_view) for of_view in counts], group.size)
-        self.own_views = [views[group.rank] for views in self.rounds if group.rank in views]
         order = [view for views in self.rounds for _, view in sorted(views.items())]
         tensors = self._rows.project([of_view[group.rank] for of_view in counts], order)
         lengths = [sum(self._sent(views)) for views in self.rounds]

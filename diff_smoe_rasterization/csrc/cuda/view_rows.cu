@@ -119,53 +119,81 @@ __global__ void __launch_bounds__(kSortBlock)
   if (threadIdx.x == kSortBlock - 1) offsets[blocks] = first;
 }
 
-// The SH row of a lane's Gaussian as the colours read it.
-template <class Rows>
-__device__ Colors<float> colors_in(const Rows& rows, const GaussianInputs<float>& inputs, int64_t i, const float* dc) {
-  if constexpr (Rows::kKnown) return Rows::known_colors(dc, rows.own());
-  Colors<float> colors = colors_of(inputs, kFastFeatures, i);
-  if (Rows::kStaged) colors.shs = rows.own();
-  return colors;
-}
+// What the threads of a block share, besides SH rows.
+struct SharedViews {
+  Camera<float> cameras[kMostViews];
+  int counts[kMostViews * kViewWarps];
+};
+
+// A thread's Gaussian, with its SH row and where its rows are.
+template <class Rows> class ViewLane {
+ public:
+  // sh_rows: shared memory. All threads of the block take part, and wait for each other.
+  __device__ ViewLane(const BatchArguments& arguments, SharedViews& shared, float4* sh_rows)
+      : i(int64_t(blockIdx.x) * kViewBlock + threadIdx.x),
+        length(3 * arguments.inputs.num_sh),
+        first(i - threadIdx.x % kWarp),
+        rows(reinterpret_cast<float*>(sh_rows) + threadIdx.x / kWarp * kWarp * Rows::stride(length), length,
+             static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, arguments.inputs.num_gaussians - first))),
+             threadIdx.x % kWarp),
+        of_views(arguments, i, shared.counts),
+        config(arguments.config),
+        inputs_(arguments.inputs),
+        own_(i < inputs_.num_gaussians ? i : 0) {
+    load_cameras(arguments, shared.cameras);
+    if constexpr (Rows::kStaged) {
+      rows.load(inputs_.shs + first * length, __ballot_sync(kAllLanes, of_views.has_row()));
+      wait_for_copies();
+    }
+    __syncthreads();
+    gaussian = Rows::gaussian(inputs_, own_);
+    if constexpr (Rows::kDcApart) store3(dc_, load3(inputs_.dc + 3 * own_));
+    config.num_channels = kFastFeatures;
+    config.leave_out_further_features();
+  }
+
+  __device__ ColorSource<float> source(const Camera<float>& camera) const {
+    return {colors(), gaussian.mean, camera, config};
+  }
+
+  const int64_t i;      // of the Gaussian, which may not exist
+  const int length;     // numbers of an SH row
+  const int64_t first;  // Gaussian of the warp
+  const Rows rows;
+  const RowsOfViews of_views;
+  RasterConfig<float> config;
+  Gaussian<float> gaussian;
+
+ private:
+  __device__ Colors<float> colors() const {
+    if constexpr (Rows::kKnown) return Rows::known_colors(dc_, rows.own());
+    Colors<float> colors = colors_of(inputs_, kFastFeatures, own_);
+    if (Rows::kStaged) colors.shs = rows.own();
+    return colors;
+  }
+
+  const GaussianInputs<float>& inputs_;
+  const int64_t own_;  // a Gaussian that exists
+  float dc_[3];        // if degree 0 lies apart
+};
 
 template <class Rows>
 __global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_constant__ BatchArguments arguments) {
-  __shared__ Camera<float> cameras[kMostViews];
-  __shared__ int counts[kMostViews * kViewWarps];
+  __shared__ SharedViews shared;
   extern __shared__ float4 shared_rows[];
-  const GaussianInputs<float>& inputs = arguments.inputs;
-  const int64_t i = int64_t(blockIdx.x) * kViewBlock + threadIdx.x;
-  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp, length = 3 * inputs.num_sh;
-  const int64_t first = i - lane, own = i < inputs.num_gaussians ? i : 0;
-  const int exist = static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, inputs.num_gaussians - first)));
-  load_cameras(arguments, cameras);
-  const RowsOfViews of_views(arguments, i, counts);
-  const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length, exist, lane);
-  if constexpr (Rows::kStaged) {
-    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.has_row()));
-    wait_for_copies();
-  }
-  __syncthreads();
-  const Gaussian<float> gaussian = Rows::gaussian(inputs, own);
-  float dc[3] = {};
-  if constexpr (Rows::kDcApart) store3(dc, load3(inputs.dc + 3 * own));
-  RasterConfig<float> config = arguments.config;
-  config.num_channels = kFastFeatures;
-  config.leave_out_further_features();
+  const ViewLane<Rows> lane(arguments, shared, shared_rows);
   for (int v = 0; v < arguments.num_views; ++v) {
     const auto& view = arguments.views[v];
-    int32_t radius = of_views.radius(v);
-    const int64_t row = of_views.row(v, radius);
+    int32_t radius = lane.of_views.radius(v);
+    const int64_t row = lane.of_views.row(v, radius);
     if (row < 0) continue;
-    auto [radius_again, projected] = project(gaussian, cameras[v], config.projection_rules());
+    auto [radius_again, projected] = project(lane.gaussian, shared.cameras[v], lane.config.projection_rules());
     float features[kFastFeatures] = {};
     // Rounding may differ from that of the kernel that counted: then the Gaussian is culled only here.
-    if (radius_again == 0 ||
-        !write_features<float>({colors_in(rows, inputs, own, dc), gaussian.mean, cameras[v], config}, projected.depth,
-                               features)) {
+    if (radius_again == 0 || !write_features<float>(lane.source(shared.cameras[v]), projected.depth, features)) {
       radius = 0, projected = {};
       features[0] = features[1] = features[2] = 0;
-      view.radii[i] = kCulledInRow;
+      view.radii[lane.i] = kCulledInRow;
     }
     *reinterpret_cast<ProjectedGaussian<float>*>(view.gates + row * kProjectedGaussianSize) = projected;
     *reinterpret_cast<float4*>(view.features + row * kRowFeatures) =
@@ -176,34 +204,15 @@ __global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_c
 template <class Rows>
 __global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlocks : 1)
     project_rows_backward_kernel(const __grid_constant__ BatchArguments arguments) {
-  __shared__ Camera<float> cameras[kMostViews];
-  __shared__ int counts[kMostViews * kViewWarps];
+  __shared__ SharedViews shared;
   extern __shared__ float4 shared_rows[];
-  const GaussianInputs<float>& inputs = arguments.inputs;
+  const ViewLane<Rows> lane(arguments, shared, shared_rows);
   const GaussianGradients<float>& gradients = arguments.gradients;
-  const int64_t i = int64_t(blockIdx.x) * kViewBlock + threadIdx.x;
-  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp, length = 3 * inputs.num_sh;
-  const int64_t first = i - lane, own = i < inputs.num_gaussians ? i : 0;
-  const int exist = static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, inputs.num_gaussians - first)));
-  load_cameras(arguments, cameras);
-  const RowsOfViews of_views(arguments, i, counts);
-  const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length, exist, lane);
-  if constexpr (Rows::kStaged) {
-    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, of_views.has_row()));
-    wait_for_copies();
-  }
-  __syncthreads();
-  const Gaussian<float> gaussian = Rows::gaussian(inputs, own);
-  float dc[3] = {};
-  if constexpr (Rows::kDcApart) store3(dc, load3(inputs.dc + 3 * own));
-  RasterConfig<float> config = arguments.config;
-  config.num_channels = kFastFeatures;
-  config.leave_out_further_features();
   ViewSum<Rows::kKnown ? Rows::kLength : kAllShLength> sum;
   for (int v = 0; v < arguments.num_views; ++v) {
     const auto& view = arguments.views[v];
-    const int32_t radius = of_views.radius(v);
-    const int64_t row = of_views.row(v, radius);
+    const int32_t radius = lane.of_views.radius(v);
+    const int64_t row = lane.of_views.row(v, radius);
     if (row < 0 || radius < 0) continue;
     const float4 four = *reinterpret_cast<const float4*>(view.features + row * kRowFeatures);
     const float features[kFastFeatures] = {four.x, four.y, four.z};
@@ -211,24 +220,23 @@ __global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlock
     for (int k = 0; k < kNumGateGradients + kFastFeatures; ++k) {
       record[k] = view.records[row * (kNumGateGradients + kFastFeatures) + k];
     }
-    const auto by_view =
-        sum.add(gaussian, {colors_in(rows, inputs, own, dc), gaussian.mean, cameras[v], config}, features, record);
-    if (view.means2D != nullptr) store3<float>(view.means2D + 3 * i, {by_view.mean2D.x, by_view.mean2D.y, 0});
+    const auto by_view = sum.add(lane.gaussian, lane.source(shared.cameras[v]), features, record);
+    if (view.means2D != nullptr) store3<float>(view.means2D + 3 * lane.i, {by_view.mean2D.x, by_view.mean2D.y, 0});
   }
   __syncwarp();
   if constexpr (Rows::kKnown) {
-    rows.write(sum.shs);
-    store_gradients<Rows>({sum.gaussian, {sum.dc[0], sum.dc[1], sum.dc[2]}}, rows, gradients, rows.all());
+    lane.rows.write(sum.shs);
+    store_gradients<Rows>({sum.gaussian, {sum.dc[0], sum.dc[1], sum.dc[2]}}, lane.rows, gradients, lane.rows.all());
   } else {
-    if (i < inputs.num_gaussians) {
-      store_gradient(sum.gaussian, gradients, i);
-      if (gradients.dc != nullptr) store3(gradients.dc + 3 * i, load3(sum.dc));
-      for (int k = 0; gradients.shs != nullptr && k < length; ++k) {
-        (Rows::kStaged ? rows.own() : gradients.shs + i * length)[k] = sum.shs[k];
+    if (lane.i < arguments.inputs.num_gaussians) {
+      store_gradient(sum.gaussian, gradients, lane.i);
+      if (gradients.dc != nullptr) store3(gradients.dc + 3 * lane.i, load3(sum.dc));
+      for (int k = 0; gradients.shs != nullptr && k < lane.length; ++k) {
+        (Rows::kStaged ? lane.rows.own() : gradients.shs + lane.i * lane.length)[k] = sum.shs[k];
       }
     }
     if constexpr (Rows::kStaged) {
-      if (gradients.shs != nullptr) rows.store(gradients.shs + first * length, rows.all());
+      if (gradients.shs != nullptr) lane.rows.store(gradients.shs + lane.first * lane.length, lane.rows.all());
     }
   }
 }
