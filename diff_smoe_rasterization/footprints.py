@@ -20,7 +20,8 @@ from .learned_gate import gate_of
 from .settings import BLEND_MODES, FEATURE_OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
-_GATE_NUMBERS = 8  # centre (2), conic (3), opacity, squared reach, depth
+GATE_NUMBERS = 8
+"""Numbers of a gate: centre (2), conic (3), opacity, squared reach, depth."""
 GATE_GRADIENTS = 6
 """Numbers of a gate that have a gradient from the pixels: the first six."""
 _OPACITY, _REACH = 5, 6
@@ -174,7 +175,7 @@ class _Project(torch.autograd.Function):
         *inputs, features, opacities, radii = ctx.saved_tensors
         wanted = list(ctx.needs_input_grad[1:])
         belongs = [want and name not in ("bg", "background_gate") for want, name in zip(wanted, INPUTS)]
-        by_gates = features.new_zeros(len(features), _GATE_NUMBERS) if dL_dgates is None else dL_dgates
+        by_gates = features.new_zeros(len(features), GATE_NUMBERS) if dL_dgates is None else dL_dgates
         by_features = torch.zeros_like(features) if dL_dfeatures is None else dL_dfeatures
         records = torch.cat([by_gates[:, :GATE_GRADIENTS], by_features], 1)
         if dL_dgates is not None:

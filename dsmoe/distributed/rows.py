@@ -7,11 +7,11 @@ import torch
 
 from diff_smoe_rasterization.autograd import INPUTS
 from diff_smoe_rasterization.core import _core
-from diff_smoe_rasterization.footprints import projection_arguments
+from diff_smoe_rasterization.footprints import GATE_NUMBERS, projection_arguments
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
 _OPS = torch.ops.diff_smoe_rasterization
-GATE_NUMBERS, FEATURE_NUMBERS = 8, 4  # of a row: those of a footprint; its colour, and the bits of its radius
+FEATURE_NUMBERS = 4  # of a row: the colour, and the bits of the radius
 
 
 class ViewRows:

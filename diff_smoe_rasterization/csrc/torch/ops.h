@@ -252,8 +252,8 @@ template <class Backend> void blend(Arguments& arguments) {
   of.gates = padded(of.gates, kProjectedGaussianSize);
   const int64_t num_features = of.background.numel() + num_further_features(options);
   const int64_t columns = Backend::feature_columns(num_features);
-  if (of.features.size(1) != columns) of.features = padded(of.features.narrow(1, 0, num_features), columns);
-  of.features = padded(of.features, columns);
+  const bool filled_up = of.features.size(1) == columns;
+  of.features = padded(filled_up ? of.features : of.features.narrow(1, 0, num_features), columns);
   of.radii = of.radii.contiguous(), of.background = of.background.contiguous();
   const ImageSizes sizes = {of.gates.size(0), of.background.numel()};
   Images images = allocate_images(of.gates, sizes, options);

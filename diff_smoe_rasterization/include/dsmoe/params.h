@@ -235,7 +235,8 @@ constexpr int kMostViews = 16;   // of one batch
 constexpr int kRowFeatures = 4;  // numbers: a colour, and the bits of the radius
 inline int64_t num_view_blocks(int64_t num_gaussians) { return (num_gaussians + kViewBlock - 1) / kViewBlock; }
 
-// The radius of a Gaussian that has a row, and is culled all the same: its colour is not finite. Its row is zero.
+// The radius of a Gaussian that has a row, and is culled all the same, mostly because its colour is not finite. Its row
+// is zero.
 constexpr int32_t kCulledInRow = -1;
 
 template <class BackendCamera> struct BatchView {
