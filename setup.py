@@ -33,7 +33,8 @@ SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
 # The oldest PyTorch whose stable ABI has what the ops take, and as its headers write it.
 STABLE_ABI_SINCE, TORCH_TARGET_VERSION = "2.11", "0x020b000000000000"
 # The folders at the top that are parts of packages, by the link that puts each there.
-LINKS = {"diff_smoe_rasterization/integrations": "../integrations", "dsmoe/patches": "../patches"}
+LINKS = {"diff_smoe_rasterization/integrations": "../integrations", "dsmoe/bench": "../benchmarks/harness",
+         "dsmoe/patches": "../patches"}
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 
 

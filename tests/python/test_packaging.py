@@ -68,13 +68,13 @@ def test_links_of_the_tree_are_made_again(tmp_path, as_text):
     assert {path.relative_to(ROOT).as_posix(): os.readlink(path) for path in links} == setup.LINKS
     for link, target in setup.LINKS.items():
         path = tmp_path / link
-        path.parent.mkdir()
+        path.parent.mkdir(exist_ok=True)
         if as_text:
             path.write_text(target)
-        (tmp_path / path.name).mkdir()
+        (path.parent / target).mkdir(parents=True, exist_ok=True)
     for _ in range(2):
         setup.restore_links(tmp_path)
-        assert all((tmp_path / link).samefile(tmp_path / Path(link).name) for link in setup.LINKS)
+        assert all((tmp_path / link).samefile((tmp_path / link).parent / target) for link, target in setup.LINKS.items())
 
 
 def test_an_sdist_holds_each_file_of_the_linked_folders_once(tmp_path):
@@ -82,10 +82,11 @@ def test_an_sdist_holds_each_file_of_the_linked_folders_once(tmp_path):
     subprocess.run([sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)], cwd=str(ROOT),
                    check=True, stderr=subprocess.PIPE)
     names = next(tmp_path.glob("*.egg-info/SOURCES.txt")).read_text().splitlines()
-    for folder in ("integrations", "patches"):
-        held = [name for name in names if f"/{folder}/" in f"/{name}" and not name.startswith("tests/")]
+    for folder, link in (("integrations", "integrations"), ("patches", "patches"), ("benchmarks/harness", "bench")):
+        held = [name for name in names if (name.startswith(folder + "/") or f"/{link}/" in name)
+                and not name.startswith("tests/") and name.endswith((".py", ".md"))]
         there = [path for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".md")]
-        assert f"{folder}/README.md" in held
+        assert f"{folder}/__init__.py" in held
         assert sorted(held) == sorted(path.relative_to(ROOT).as_posix() for path in there)
 
 
