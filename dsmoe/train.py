@@ -124,7 +124,8 @@ class Run:
         trainer, config = self.trainer, self.trainer.config
         gate, model = trainer.background_gate, trainer.whole_model()
         if trainer.leads:
-            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate)
+            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate,
+                       config.faint_below)
         evaluation = trainer.evaluate(self.progress)
         row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation, gate)
         if not trainer.leads:

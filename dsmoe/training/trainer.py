@@ -48,7 +48,7 @@ class Trainer:
         self.renderer = Renderer(
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),
-            deterministic=config.deterministic)
+            faint_below=config.faint_below, deterministic=config.deterministic)
         self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
             lambda views: self.passes.look(views), self.shards))
