@@ -109,8 +109,12 @@ class ImportanceStrategy(SteadyStrategy):
                           for part in parts])
 
     def is_of_few(self) -> torch.Tensor:
-        """[N] which Gaussians few views need; of fewer views that a decision looks at, as small a part."""
-        return self.needed * len(self.context.views) < self.options.needs * self.looks
+        """[N] which Gaussians few views need, at most half of all; of views that a decision looks at, as small a part.
+
+        Of one or two views no Gaussian could have three.
+        """
+        views = len(self.context.views)
+        return self.needed * views < min(self.options.needs, views / 2) * self.looks
 
     def squares(self, iteration: int) -> float:
         return self.options.squares if iteration > self.moves_end else 0.0

@@ -356,6 +356,33 @@ def test_what_two_views_or_fewer_need_moves(tiny_config, monkeypatch, settings, 
     assert moved == [expected]
 
 
+@pytest.mark.parametrize("views, enough", [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (6, 3), (7, 3)])
+def test_few_views_are_at_most_half_of_all(tiny_config, views, enough):
+    """With one or two training views every Gaussian else counted as free of cost, and any of them moved."""
+    scene = load_scene(tiny_config, progress=False)
+    assert len(scene.train) == 7
+    config = tiny_config.changed(strategy="importance", budget=60)
+    strategy = Trainer(config, dataclasses.replace(scene, train=scene.train[:views])).strategy
+    strategy.needed = (torch.arange(len(strategy.needed)) % (views + 1)).float()
+    assert torch.equal(strategy.is_of_few(), strategy.needed < enough)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_with_few_views_the_cheapest_move(tiny_config, views):
+    """A tenth, onto the largest error; every Gaussian has a cost of its own."""
+    scene = load_scene(tiny_config, progress=False)
+    config = tiny_config.changed(strategy="importance", budget=60, strategy_options="near=0,worth=1e9")
+    strategy = Trainer(config, dataclasses.replace(scene, train=scene.train[:views])).strategy
+    count = len(strategy.needed)
+    strategy.costs = costs = 1 + torch.randperm(count).float()
+    strategy.errors, strategy.needed, strategy.sought = torch.ones(count), torch.full((count,), float(views)), {}
+    moved = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(strategy, "split", lambda parents, rows: moved.extend(rows.tolist()))
+        strategy.move()
+    assert sorted(float(cost) for cost in costs[moved]) == [1.0 + row for row in range(int(0.1 * count))]
+
+
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_the_model_is_an_average_of_the_last_part(tiny_config, mode):
     """Behind step 42 of 60 of each step: of the first four the mean, then a quarter of each further one."""
