@@ -251,8 +251,20 @@ def gsplat_of_run() -> None:
         for module in ("gsplat", "gsplat.rendering", "gsplat.relocation", "gsplat.strategy.ops"):
             if hasattr(sys.modules.get(module), name):
                 setattr(sys.modules[module], name, function)
+    for module in filter(None, map(sys.modules.get, ("gsplat", "gsplat.rendering"))):
+        for name in [name for name in vars(module) if name.startswith("rasterization_")]:
+            setattr(module, name, _refusing(name))  # which a trainer may call by its options alone
     keep_records()
     _say_rasterizer("gsplat")
+
+
+def _refusing(name: str) -> Callable[..., Any]:
+    """Returns what stands for a rasterizer of gsplat's that this package has not."""
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise NotImplementedError(f"dsmoe run: the trainer calls gsplat's {name}, which this package has not; choose "
+                                  "gsplat's rasterization in the trainer's options, or run it without dsmoe run")
+
+    return refuse
 
 
 def is_installed(module: str) -> bool:
