@@ -14,6 +14,8 @@ from .results.video import check_folder, check_video, is_video, write_video
 from .scenes.cameras import Camera
 from .system.progress import progress_bar
 
+LEAST_FPS, MOST_FPS = 0.01, 1000.0  # a .gif shows a frame for at most 655 s
+
 
 def film(trained: Trained, path: str, frames: int = ORBIT_FRAMES, fps: float = VIDEO_FPS, outputs: Sequence[str] = (),
          overwrite: bool = False) -> str:
@@ -24,8 +26,8 @@ def film(trained: Trained, path: str, frames: int = ORBIT_FRAMES, fps: float = V
     """
     if frames < 1:
         raise TrainerError(f"--frames is {frames}; it must be at least 1")
-    if not 0 < fps <= 1000:
-        raise TrainerError(f"--fps is {fps:g}; it must be above 0 and at most 1000")
+    if not LEAST_FPS <= fps <= MOST_FPS:
+        raise TrainerError(f"--fps is {fps:g}; it must be from {LEAST_FPS:g} to {MOST_FPS:g}")
     if not is_video(path):
         check_folder(path, orbit=True)
     cameras = trained.orbit.cameras(frames, trained.cameras[0])
