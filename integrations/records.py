@@ -41,7 +41,8 @@ class Record(NamedTuple):
     """What a file says of the blend of the process that wrote it."""
 
     blend_mode: str
-    background_gate: Optional[float] = None  # None in modes that know none
+    background_gate: Any = None  # None in modes that know none; of a process also LEARNED
+    faint_below: Optional[float] = None  # None: as usual in this mode
     learned: Optional[Dict[str, Any]] = None  # state_dict of a gate that was still learned
 
 
@@ -100,29 +101,32 @@ def _wrap_load(owner: Any, name: str, keyword: str, is_model: Callable[[Any], bo
 
 def recorded() -> Dict[str, Any]:
     """Returns what files of this process record; {} in `alpha`, and where a learned gate is not known yet."""
-    mode, background_gate = blend_of_process() or ("alpha", None)
-    if mode == "alpha" or background_gate is None:
-        return {} if mode == "alpha" else {"blend_mode": mode}
-    if background_gate != settings.LEARNED:
-        return {"blend_mode": mode, "background_gate": background_gate}
-    if not (gate.blend_mode and gate.is_known):
-        return {}  # nothing was rendered with it
-    return {"blend_mode": mode, "background_gate": gate.value(),
-            **({} if gate.frozen else {"learned": gate.state_dict()})}
+    own = blend_of_process()
+    if not own or own.blend_mode == "alpha":
+        return {}
+    if own.background_gate == settings.LEARNED:
+        if not (gate.blend_mode and gate.is_known):
+            return {}  # nothing was rendered with it
+        own = own._replace(background_gate=gate.value(), learned=None if gate.frozen else gate.state_dict())
+    return {name: value for name, value in own._asdict().items() if value is not None}
 
 
-def blend_of_process() -> Optional[Tuple[str, Any]]:
-    """Returns blend mode and background gate of this process, None in modes that know none.
+def blend_of_process() -> Optional[Record]:
+    """Returns how this process blends.
 
     None if only the settings of its renderings say it, and none with a learned gate was there yet.
     """
+    mode, background_gate = (settings.blend_of_process or (os.environ.get(settings.BLEND_MODE_VARIABLE), None))[:2]
     if gate.blend_mode:
-        return gate.blend_mode, settings.LEARNED
-    mode, background_gate = settings.blend_of_process or (os.environ.get(settings.BLEND_MODE_VARIABLE), None)
+        mode, background_gate = gate.blend_mode, settings.LEARNED
     if not mode:
         return None
     mode = settings.resolve_blend_mode(mode)
-    return mode, (settings.resolve_background_gate(mode, background_gate) if mode in settings.GATED_MODES else None)
+    if mode not in settings.GATED_MODES:
+        return Record(mode)
+    faint = settings.resolve_faint_below(mode, None)
+    return Record(mode, settings.resolve_background_gate(mode, background_gate),
+                  None if faint == settings.usual_faint_below(mode) else faint)
 
 
 def _is_path(file: Any) -> bool:
@@ -209,9 +213,10 @@ def _with_record(ply: Any) -> Any:
 
 def _take_ply(ply: Any, arguments: Tuple[Any, ...]) -> Any:
     said: Dict[str, Any] = dict(line.partition(" ")[::2] for line in ply.comments)
-    with contextlib.suppress(KeyError, ValueError):
-        said["background_gate"] = float(said["background_gate"])
     said.pop("learned", None)
+    for name in ("background_gate", "faint_below"):
+        with contextlib.suppress(KeyError, ValueError):
+            said[name] = float(said[name])
     _take(arguments[0] if arguments else "the .ply", lambda: said if "blend_mode" in said else None,
           _has_gaussians(ply))
     return ply
@@ -240,11 +245,13 @@ def checked(said: Any) -> Record:
         return Record(mode)
     # A .ply that records a mode and no gate was trained with 0, as for `dsmoe render`.
     background_gate = _number("the background gate", said.get("background_gate", 0.0), 0, settings.MAX_BACKGROUND_GATE)
-    state = said.get("learned")
+    faint, state = said.get("faint_below"), said.get("learned")
+    if faint is not None:
+        faint = _number("faint_below", faint, 0, settings.MAX_BACKGROUND_GATE)
     if state is not None:
         state = {"logarithm": _number("the gate's logarithm", state["logarithm"], -LIMIT - 1, LIMIT + 1),
                  "adam": _checked_adam(state["adam"])}
-    return Record(mode, background_gate, state)
+    return Record(mode, background_gate, faint, state)
 
 
 def _checked_adam(adam: Any) -> Dict[str, Any]:
@@ -276,28 +283,40 @@ def _take(file: Any, said: Callable[[], Any], is_model: bool) -> None:
         record = None if found is None else checked(found)
     except (KeyError, TypeError, *DAMAGE) as error:
         damage = f"its record of mode and gate is damaged ({type(error).__name__}: {error})"
-    mode, background_gate = own or (record.blend_mode if record else None, settings.LEARNED)
-    blends = f"this process blends by {mode}"
-    if record and record.blend_mode == mode:
-        if record.background_gate is not None and background_gate == settings.LEARNED:
-            gate.found(record.background_gate, record.learned)
-            print(f"{PROGRAM}: {name} records the background gate {gate.value():.6g}", file=sys.stderr, flush=True)
-        elif record.background_gate != background_gate:
-            _warn(name, f"it is of {mode} with the background gate {record.background_gate:.6g}, and {blends} with "
-                        f"{background_gate:.6g}; --background_gate {record.background_gate!r} is as it was")
-        return
+    if own is None:  # its settings say it
+        own = record._replace(background_gate=settings.LEARNED) if record else Record("alpha")
+    is_learned, same_mode = own.background_gate == settings.LEARNED, record and record.blend_mode == own.blend_mode
     if damage:
         _warn(name, f"{damage}; it counts as a file without one")
-    if record:
-        gate_too = "" if record.background_gate is None else f" --background_gate {record.background_gate!r}"
-        _warn(name, f"it is of {record.blend_mode}, and {blends}, in which its Gaussians show another scene; "
-                    f"--blend_mode {record.blend_mode}{gate_too} is as it was")
-    if is_model and mode in settings.GATED_MODES and background_gate == settings.LEARNED and not gate.learns:
+    if record and same_mode and is_learned and record.background_gate is not None:
+        gate.found(record.background_gate, record.learned)
+        print(f"{PROGRAM}: {name} records the background gate {gate.value():.6g}", file=sys.stderr, flush=True)
+    elif is_learned and is_model and not gate.learns:
         gate.found(0.0)
-    if not record and is_model and mode not in (None, "alpha") and not gate.learns:
-        learned = (f" with the background gate 0 where nothing is learned, and learning starts at {START}; "
-                   "--background_gate says otherwise" if background_gate == settings.LEARNED else "")
-        _warn(name, f"it records no blend mode, as a file of alpha, and {blends}{learned}")
+    if record:
+        differs = [one for one, mine in zip(record[:3], own) if one != mine and mine != settings.LEARNED]
+        another = "" if same_mode else ", in which its Gaussians show another scene"
+        if differs:
+            _warn(name, f"it is of {_said_of(record)}, and this process blends by {_said_of(own)}{another}; "
+                        f"{_options_of(record)} is as it was")
+    elif is_model and own.blend_mode != "alpha" and not gate.learns:
+        learned = (f". The gate is 0 where nothing is learned, and learning starts at {START}; --background_gate says "
+                   "otherwise" if is_learned else "")
+        _warn(name, "it records no blend mode, as a file of alpha, and this process blends by "
+                    f"{_said_of(own)}{learned}")
+
+
+def _said_of(blend: Record) -> str:
+    """Returns "smoe, background gate 0.3, faint_below 2"."""
+    values = zip(("background gate", "faint_below"), blend[1:3])
+    return ", ".join([blend.blend_mode, *(f"{name} {value}" for name, value in values if value is not None)])
+
+
+def _options_of(blend: Record) -> str:
+    """Returns what is typed for a blend; `faint_below` has only a variable everywhere."""
+    values = zip((f"${settings.FAINT_BELOW_VARIABLE}=", "--blend_mode ", "--background_gate "),
+                 (blend.faint_below, *blend[:2]))
+    return " ".join(f"{name}{value}".lstrip("$") for name, value in values if value is not None)
 
 
 def _warn(name: str, text: str) -> None:

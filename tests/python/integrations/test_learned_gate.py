@@ -5,6 +5,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import stat
 import struct
 import threading
@@ -346,7 +347,7 @@ def test_a_model_without_a_record_counts_as_one_of_alpha(kind, tmp_path, process
     load(path)
     load(path)
     said = capfd.readouterr().err
-    assert said.count("the background gate 0 where nothing is learned, and learning starts at 0.1;") == 1
+    assert said.count("The gate is 0 where nothing is learned, and learning starts at 0.1;") == 1
     view, gaussians = scene()
     with torch.no_grad():
         assert torch.equal(image(view, gaussians), image(view._replace(background_gate=0.0), gaussians))
@@ -372,6 +373,7 @@ OF_GATE = {"blend_mode": "smoe", "background_gate": 0.25}
 ADAM = {"step": 3, "exp_avg": 0.0, "exp_avg_sq": 0.0}
 DAMAGED = [
     *({**OF_GATE, "background_gate": value} for value in (math.nan, -1, -0.1, math.inf, 1e31, "0.25", None, True, [1])),
+    *({**OF_GATE, "faint_below": value} for value in (math.nan, -1, "2", [])),
     *({**OF_GATE, "blend_mode": value} for value in ("smo", None, 3, ["smoe"], {})), {}, [], 3, "smoe", None,
     b"", b"{", b"\xff\xfe", b"[" * 3000, b"[" * 900 + b"]" * 900, b'{"blend_mode": "smoe", "background_gate": 1e999}',
     b'{"blend_mode": "smoe", "background_gate": ' + b"9" * 5000 + b"}",
@@ -400,12 +402,13 @@ def test_a_damaged_record_counts_as_none(kind, tmp_path, process, capfd):
 
 @pytest.mark.parametrize("comments", [
     {"blend_mode": "smoe", "background_gate": value} for value in ("nan", "-1", "inf", "x", "", "1e31")] + [
-    {"blend_mode": "smo", "background_gate": "0.25"}, {"blend_mode": ""}, {"blend_mode": "smoe smoe"}])
+    {"blend_mode": "smo", "background_gate": "0.25"}, {"blend_mode": ""}, {"blend_mode": "smoe smoe"},
+    {"blend_mode": "smoe", "faint_below": "nan"}])
 def test_damaged_comments_of_a_ply_count_as_none(comments, tmp_path, process, capfd):
     with_record(".ply", tmp_path / "a.ply", comments)
     process("smoe")
     assert read_ply(tmp_path / "a.ply").shape == (1,)
-    assert "record of mode and gate is damaged (ValueError: the b" in capfd.readouterr().err and gate.value() == 0
+    assert "record of mode and gate is damaged (ValueError: " in capfd.readouterr().err and gate.value() == 0
 
 
 def test_comments_that_are_no_record_are_not_read_as_one(tmp_path, process, capfd):
@@ -427,13 +430,15 @@ def test_comments_that_are_no_record_are_not_read_as_one(tmp_path, process, capf
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("own, record, said", [
-    (("smoe_eq7", 0.0), ("smoe_eq7", 0.3), "of smoe_eq7 with the background gate 0.3, and this process blends by "
-                                           "smoe_eq7 with 0; --background_gate 0.3 is as it was"),
-    (("smoe", 0.5), ("smoe", 0.3), "the background gate 0.3, and this process blends by smoe with 0.5; "),
+    (("smoe_eq7", 0.0), ("smoe_eq7", 0.3), "of smoe_eq7, background gate 0.3, and this process blends by smoe_eq7, "
+                                           "background gate 0.0; --blend_mode smoe_eq7 --background_gate 0.3 is as"),
+    (("smoe", 0.5), ("smoe", 0.3), "gate 0.3, and this process blends by smoe, background gate 0.5; --blend_mode smoe"),
     (("smoe_eq7", 0.3), ("smoe", 0.3), "--blend_mode smoe --background_gate 0.3 is as it was"),
-    (("smoe", "learned"), ("smoe_eq7", 0.3), "it is of smoe_eq7, and this process blends by smoe, in which"),
-    (("alpha", ""), ("smoe", 0.3), "it is of smoe, and this process blends by alpha, in which its Gaussians show"),
+    (("smoe", "learned"), ("smoe_eq7", 0.3), "by smoe, background gate learned, in which its Gaussians show another"),
+    (("alpha", ""), ("smoe", 0.3), "gate 0.3, and this process blends by alpha, in which its Gaussians show another"),
     (("smoe_tn", ""), ("smoe_std",), "by smoe_tn, in which its Gaussians show another scene; --blend_mode smoe_std is"),
+    (("smoe", 0), ("smoe", 0.0, 2.0), "it is of smoe, background gate 0.0, faint_below 2.0, and this process blends by "
+                                      "smoe, background gate 0.0; DSMOE_FAINT_BELOW=2.0 --blend_mode smoe --back"),
     (("smoe", 0.3), ("smoe", 0.3), ""), (("smoe_tn", ""), ("smoe_tn",), ""),
     (("smoe", "learned"), ("smoe", 0.3), "records the background gate 0.3")])
 def test_a_model_of_another_blend_is_named(kind, own, record, said, tmp_path, process, capfd):
@@ -441,12 +446,29 @@ def test_a_model_of_another_blend_is_named(kind, own, record, said, tmp_path, pr
     process("alpha")
     if kind != ".ply":
         KINDS[kind][0](path)
-    with_record(kind, path, dict(zip(("blend_mode", "background_gate"), record)))
+    with_record(kind, path, dict(zip(("blend_mode", "background_gate", "faint_below"), record)))
     process(*own)
     KINDS[kind][1](path)
     told = capfd.readouterr().err
     assert said in told and told.count("\n") == bool(said)
     assert own[1] != "learned" or gate.value() == (0.3 if record[0] == "smoe" else 0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_faint_pairs_of_a_process_are_recorded_and_compared(kind, tmp_path, process, capfd, monkeypatch):
+    """Only where they are unusual, so that other programs' files stay as they are."""
+    path = tmp_path / ("model" + kind)
+    process("smoe", 0.3)
+    KINDS[kind][0](path)
+    assert b"faint_below" not in path.read_bytes()
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "2")
+    KINDS[kind][0](path)
+    KINDS[kind][1](path)
+    assert not capfd.readouterr().err
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "1")
+    KINDS[kind][1](path)
+    assert "faint_below 2.0, and this process blends by smoe, background gate 0.3, faint_below 1.0" in (
+        capfd.readouterr().err)
 
 
 @pytest.mark.parametrize("mode", ["smoe_tn", "smoe_eq7"])
@@ -458,7 +480,8 @@ def test_a_mode_without_a_learned_gate_is_recorded_too(kind, mode, tmp_path, pro
     assert not capfd.readouterr().err
     process("smoe", 0.3)
     KINDS[kind][1](tmp_path / ("model" + kind))
-    assert f"it is of {mode}, and this process blends by smoe" in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert re.search(f"it is of {mode}(, background gate 0.3)?, and this process blends by smoe,", said)
 
 
 def test_a_save_that_is_killed_leaves_the_file_of_before(tmp_path, process):
