@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from typing import Any, Callable, List, Optional, Sequence, Tuple
 
 from .choices import CAMERA_MODEL, MATCHING, MOST_EXHAUSTIVE
+from .early import FROM_VIDEO, VIDEO_ENDINGS, check_photos
 from .errors import SceneError, TrainerError, printable
 from .scenes.images import UNREADABLE, image_size, open_image
-from .system.files import is_file, is_folder, write_json_atomically
+from .system.files import is_file, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.process import pip_install
 from .system.progress import progress_bar
@@ -28,8 +29,6 @@ FEATURES = "photographs.json"  # of which photographs the database has features
 WRITTEN = ("images", "sparse/0", *(f"{WORK}/{name}" for name in ("models", "best", "undistorted")))
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
-VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
-FROM_VIDEO = "of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
 MIN_PHOTOS = 3
 POLL_SECONDS = 0.5
 FOCAL_LENGTH, EXIF = 37386, 0x8769  # tags
@@ -98,25 +97,13 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
                 sorted({*names} - placed), image_size(os.path.join(output, files[0])))
 
 
-def _check_folder(photos: str) -> None:
-    """Raises SceneError if it is no folder."""
-    if is_folder(photos):
-        return
-    if not is_file(photos):
-        raise SceneError(f"{photos}: no such folder of photographs")
-    if photos.lower().endswith(VIDEO_ENDINGS):
-        raise SceneError(f"{photos} is a file; {FROM_VIDEO}")
-    raise SceneError(f"{photos} is a file; name the folder of the photographs, such as "
-                     f"{os.path.dirname(photos) or '.'}")
-
-
 def photo_names(folder: str, output: str, say: Callable[[str], None] = lambda text: None) -> List[str]:
     """The photographs below a folder, by their paths in it; hidden files and the folder `output` are left out.
 
     say: is called if a video is among them. Raises SceneError if they are too few, or one is a pipe or a device, which
     reading would wait for.
     """
-    _check_folder(folder)
+    check_photos(folder)
     made = os.path.join(os.path.realpath(output), "")
     if os.path.join(os.path.realpath(folder), "").startswith(made):
         raise SceneError(f"{folder} lies in {output}, the folder to write; name another one with -o")
