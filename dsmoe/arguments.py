@@ -25,7 +25,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
     parser.add_argument("--version", action="version", version=f"dsmoe {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
                                 usage="%(prog)s SCENE -o OUT [OPTION ...]\n"
@@ -174,7 +174,7 @@ def build_parser() -> argparse.ArgumentParser:
                                      description="Prints a script for the shell. In ~/.bashrc or, behind compinit, in "
                                                  "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
     completion.add_argument("shell", choices=("bash", "zsh"))
-    for command in (train, scene, evaluate, render, export, view, run, info, completion):
+    for command in (train, scene, evaluate, render, export, view, patch, run, bench, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
@@ -194,7 +194,7 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
     parser.add_argument("--scene", help="folder " + scene)
     parser.add_argument("--blend-mode", choices=BLEND_MODES,
-                        help="needed for a .ply that does not record it; must agree where it does")
+                        help="of a .ply that does not record it (default: alpha); must agree where it does")
     parser.add_argument("--background-gate", type=number, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
     parser.add_argument("--white-background", action="store_true", default=None,
@@ -202,7 +202,7 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
 
 
 def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
-    actions = patch.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = patch.add_subparsers(dest="action", metavar="ACTION")
     for name, text in (("apply", "patch the checkout; each line of the patch says so"),
                        ("check", "say whether it is patchable, and what is patched of it"),
                        ("diff", "show what the patch changes, and write nothing"),
@@ -219,7 +219,7 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
 
 
 def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
-    actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = bench.add_subparsers(dest="action", metavar="ACTION")
     run = actions.add_parser("run", help="run what is not done yet of a suite",
                              description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
                                          "becomes a row with its reason, and the command returns 1.",

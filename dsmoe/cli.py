@@ -11,14 +11,25 @@ from typing import TYPE_CHECKING, Any, Dict, List, Optional
 from .arguments import build_parser, completion_script
 from .config import CHECKPOINT_NAME, TrainConfig, holds_run
 from .config_arguments import config_from_arguments, given_options, take_paper
+from .early import check_early
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .patches import PatchError
 from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
+from .system.process import command
 
 if TYPE_CHECKING:
     from .results.evaluation import Measure
     from .system.group import Group
+
+
+OF_OTHERS = {  # what other trainers call an option of `dsmoe train`
+    **dict.fromkeys(("--steps", "--max-steps", "--num-steps", "--iters", "--max-iters", "--max-num-iterations"),
+                    "--iterations"),
+    **dict.fromkeys(("--cap-max", "--max-cap", "--max-gaussians", "--num-gaussians"), "--budget"),
+    **dict.fromkeys(("-m", "--model-path", "--out", "--result-dir", "--output-dir"), "--output"),
+    **dict.fromkeys(("-s", "--source-path", "--data", "--data-dir"), "SCENE"),
+    **dict.fromkeys(("--downscale-factor", "--data-factor"), "--resolution")}
 
 
 def main(argv: Optional[List[str]] = None) -> int:
@@ -27,10 +38,14 @@ def main(argv: Optional[List[str]] = None) -> int:
     print_any_name()
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
+    if not unknown and getattr(arguments, "action", True) is None or arguments.command is None:
+        getattr(arguments, "command_parser", parser).print_help(sys.stderr)
+        return 2
     arguments.command_words = list(sys.argv[1:] if argv is None else argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
         _refuse(unknown, getattr(arguments, "command_parser", parser))
     try:
+        check_early(arguments)
         status = COMMANDS[arguments.command](arguments) or 0
         sys.stdout.flush()
         return status
@@ -45,18 +60,31 @@ def main(argv: Optional[List[str]] = None) -> int:
         return 1
     except KeyboardInterrupt as stop:
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
-        hint = "; continue it with --resume" if continues else ""
+        hint = f"; continue it with: {_resume_command(arguments.output)}" if continues else ""
         if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return exit_status(stop)
 
 
+def _resume_command(output: str) -> str:
+    """What to type to continue an interrupted training."""
+    words = [command(), "train", "--resume", "-o", shlex.quote(output)]
+    size = os.environ.get("WORLD_SIZE", "1")
+    if size == "1":
+        return " ".join(words)
+    if os.environ.get("LOCAL_WORLD_SIZE") == size and TrainConfig.load(output).device == "cuda":
+        return " ".join([*words, "--gpus", size])
+    return " ".join([*words, "(by torchrun, as before)"])
+
+
 def _refuse(unknown: List[str], parser: argparse.ArgumentParser) -> None:
     """Ends the command with its usage, the words that it does not know, and the options that may be meant."""
     options = [option for action in parser._actions for option in action.option_strings]
-    meant = [name for word in unknown if word.startswith("--")
-             for name in difflib.get_close_matches(word.partition("=")[0], options, n=1)]
+    typed = [word.partition("=")[0].replace("_", "-") for word in unknown if word.startswith("-")]
+    known = [name for name in map(OF_OTHERS.get, typed) if name in (*options, "SCENE")]
+    meant = known or [name for word in typed if word.startswith("--")
+                      for name in difflib.get_close_matches(word, options, n=1, cutoff=0.7)]
     parser.error("unrecognized arguments: " + " ".join(unknown)
                  + (f" (is {', '.join(meant)} meant?)" if meant else ""))
 
@@ -88,6 +116,9 @@ def _bench_run(arguments: argparse.Namespace) -> int:
     failed = sum(not row["ok"] for row in rows)
     if failed:
         print(f"{failed} of {len(rows)} cells failed; their rows say why, --retry-failed runs them again")
+    if rows:
+        results = arguments.output or os.path.join("bench_results", rows[0]["suite"])
+        print(f"rows: {printable(results)}; tables and curves of them: {command()} bench report {shlex.quote(results)}")
     return 1 if failed else 0
 
 
@@ -157,7 +188,6 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     from .results.modelfile import model_path
     from .results.rows import blend_name, results_table, viewer_warning
     from .system.device import device_line
-    from .system.process import command
     from .train import train
 
     if not group.leads:
@@ -259,7 +289,6 @@ def _with_lpips(net: str, device: str) -> Measure:
 
 def _render(arguments: argparse.Namespace) -> None:
     from .inspection import render_images
-    from .opening import check_source
 
     _choose_device(arguments)
     overrides = _overrides(arguments)
@@ -270,9 +299,6 @@ def _render(arguments: argparse.Namespace) -> None:
     if is_folder(arguments.source):
         config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
-        check_source(arguments.source, "and --scene")
-        if not arguments.scene:
-            raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
                           background_gate=arguments.background_gate, outputs=outputs,

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Dict, NamedTuple, Optional, Sequence, Tuple
 
 import torch
@@ -14,7 +15,7 @@ from diff_smoe_rasterization.settings import (
     resolve_faint_below,
 )
 
-from ..errors import TrainerError
+from ..errors import TrainerError, printable
 from ..model import GaussianModel, finite_rows
 from ..system.files import new_file
 
@@ -89,16 +90,17 @@ def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tens
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
-    """The blend mode to render a .ply with: the recorded one, or the one asked for if none is recorded.
+    """The blend mode to render a .ply with: the recorded one, else the one asked for, else alpha, which a line says.
 
-    Raises TrainerError if neither is known, if they disagree, or if the recorded one is unknown.
+    Raises TrainerError if both disagree, or the recorded one is unknown.
     """
     if recorded is not None and recorded not in BLEND_MODES:
         raise TrainerError(f"{path}: its comment records the blend mode {recorded!r}; this version knows "
                            f"{', '.join(BLEND_MODES)}")
     if recorded is None and asked is None:
-        raise TrainerError(f"{path} does not say which blend mode it was trained with (no `comment blend_mode`); "
-                           "pass --blend-mode, which is alpha for files of other 3DGS programs")
+        print(f"note: {printable(path)} records no blend mode, so it is alpha, as other 3DGS programs blend; "
+              "--blend-mode says otherwise", file=sys.stderr)
+        return "alpha"
     if recorded is not None and asked is not None and asked != recorded:
         raise TrainerError(f"{path} was trained with the blend mode {recorded}, not {asked}; "
                            "in another mode its Gaussians show another scene")

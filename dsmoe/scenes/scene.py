@@ -16,6 +16,7 @@ from typing import Any, Dict, Hashable, Iterable, List, Mapping, Optional, Seque
 import numpy as np
 
 from ..config import IMAGES, TrainConfig
+from ..early import check_scene
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
 from ..system.process import command
@@ -66,9 +67,7 @@ def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layo
 def read_layout(config: TrainConfig) -> Layout:
     """Reads everything of a scene folder but its images, whose presence it checks."""
     folder = config.scene
-    if not is_folder(folder):
-        is_one = "is a file; a scene is a folder" if is_file(folder) else "no such folder"
-        raise SceneError(f"scene {folder}: {is_one}")
+    check_scene(folder)
     if is_file(os.path.join(folder, "transforms_train.json")):
         layout = read_nerf_layout(folder, config)
     elif is_folder(os.path.join(folder, "sparse")):
