@@ -17,6 +17,7 @@ from .results.rows import RESULTS_NAME, result_row, write_results
 from .results.scalars import FOLDER as SCALARS_FOLDER
 from .results.scalars import Scalars, scalar_files
 from .scenes.scene import Scene, describe_scene, load_scene, read_layout
+from .starting import check_start
 from .system.device import check_device
 from .system.files import is_file, write_atomically, write_json_atomically
 from .system.group import Group
@@ -278,6 +279,11 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         return run.train()
     earlier_files(config, resume, overwrite)
     layout = None if scene else read_layout(config)
+    if config.init and layout and not resume:  # a model of another scene is told before a folder is made
+        scene = load_scene(config, progress, layout)
+        quality = check_start(scene, config)
+        if say:
+            say(f"{config.init}: {quality.text(config)}")
     make_folder(config.output)  # a folder that cannot be made is told before images are read
     with only_one(config.output) as lock:
         earlier = earlier_files(config, resume, overwrite)  # again: another run may have been at work there
