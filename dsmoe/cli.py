@@ -189,6 +189,7 @@ def _simplify(arguments: argparse.Namespace) -> None:
     from .simplify import simplify
     from .system.process import command, set_up_process
 
+    arguments.device = getattr(arguments, "device", "auto")
     _choose_device(arguments)
     set_up_process(arguments.device)
     given = {name: value for name, value in given_options(arguments).items()
@@ -202,7 +203,7 @@ def _simplify(arguments: argparse.Namespace) -> None:
     if viewer_warning(row):
         print(viewer_warning(row))
     path = model_path(arguments.output, row["protocol"]["iterations"])
-    print(f"model: {printable(path)}, {os.path.getsize(path) / 1e6:.1f} MB; it was {row['start']['bytes'] / 1e6:.1f} MB")
+    print(f"model: {printable(path)}, {os.path.getsize(path) / 1e6:.1f} MB of {row['start']['bytes'] / 1e6:.1f} MB")
     print(f"for the web: {command()} export {shlex.quote(arguments.output)} -o model.spz")
 
 
@@ -367,4 +368,5 @@ def _completion(arguments: argparse.Namespace) -> None:
 
 
 COMMANDS = {"train": _train, "simplify": _simplify, "scene": _scene, "eval": _eval, "render": _render,
-            "export": _export, "view": _view, "patch": _patch, "run": _run, "bench": _bench, "info": _info, "completion": _completion}
+            "export": _export, "view": _view, "patch": _patch, "run": _run, "bench": _bench, "info": _info,
+            "completion": _completion}
