@@ -136,13 +136,16 @@ def _found_run(folder: str) -> Found:
     path = model_path(folder, config.iterations)
     if not is_file(path):
         raise TrainerError(f"{path}: no such file; the training in {folder} has not ended (continue it with --resume)")
-    names = ["images", "strict", "resolution", "principal_point", "test_every", "white_background",
-             "random_background", "antialiasing"]
-    if is_folder(config.scene):
-        names.append("scene")
+    names = ["test_every", "white_background", "random_background", "antialiasing"]
     if config.background_gate != LEARNED:
         names += ["blend_mode", "background_gate"]
-    return Found(path, {name: getattr(config, name) for name in names})
+    photographs = is_folder(config.scene)
+    if photographs:
+        names += ["scene", "images", "strict", "resolution", "principal_point"]
+    options = {name: getattr(config, name) for name in names}
+    if not photographs and is_file(os.path.join(folder, CAMERAS)):
+        options.update(scene=folder, resolution=1)  # the cameras are those of the resized images
+    return Found(path, options)
 
 
 def _options_of_3dgs(folder: str) -> Dict[str, Any]:

@@ -16,6 +16,7 @@ from .results.rendering import Rasterize
 from .results.rows import RESULTS_NAME, result_row, write_results
 from .results.scalars import FOLDER as SCALARS_FOLDER
 from .results.scalars import Scalars, scalar_files
+from .scenes.modelfolder import CAMERAS, cameras_content
 from .scenes.scene import Scene, describe_scene, load_scene, read_layout
 from .starting import check_start
 from .system.device import check_device
@@ -43,7 +44,8 @@ from .training.trainer import Trainer
 HISTORY_NAME = "history.json"  # the evaluations during a run
 LOSS_NAME = "loss.png"
 PER_VIEW_NAME = "per_view.json"
-PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
+# Beside config.json and the models.
+PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME, CAMERAS)
 TRAIN = "dsmoe train"  # in its folders' records
 PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
 
@@ -132,6 +134,8 @@ class Run:
             return row
         write_results(os.path.dirname(self._path(RESULTS_NAME)), [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
+        views = [*trainer.scene.test, *trainer.scene.train]
+        write_json_atomically(self._path(CAMERAS), cameras_content([view.camera for view in views]))
         if self.losses:
             write_atomically(self._path(LOSS_NAME), lambda file: loss_plot(self.losses).save(file, "PNG"))
         return row

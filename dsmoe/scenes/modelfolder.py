@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import re
-from typing import Any, List, Sequence
+from typing import Any, Dict, List, Sequence
 
 import numpy as np
 import torch
@@ -63,18 +63,27 @@ def read_model_layout(folder: str, config: TrainConfig) -> Layout:
 def _camera(entry: Any) -> Camera:
     """Of one entry: `position` and the columns of `rotation` are the camera's place and axes in the world.
 
-    The principal point is the image's centre, as in 3DGS. Raises KeyError, TypeError or ValueError.
+    The principal point is the image's centre, as in 3DGS, unless `cx` and `cy` say otherwise. Raises KeyError,
+    TypeError or ValueError.
     """
     turn, place = np.asarray(entry["rotation"], np.float64), np.asarray(entry["position"], np.float64)
-    numbers = [float(entry["fx"]), float(entry["fy"])]
     width, height = int(entry["width"]), int(entry["height"])
+    numbers = [float(entry["fx"]), float(entry["fy"]), float(entry.get("cx", width / 2)),
+               float(entry.get("cy", height / 2))]
     if turn.shape != (3, 3) or place.shape != (3,) or not np.isfinite([*turn.flat, *place, *numbers]).all():
         raise ValueError(f"`rotation` and `position` of {entry['img_name']} must be finite, [3, 3] and [3]")
     if not (np.abs(turn @ turn.T - np.eye(3)).max() < MAX_SKEW and np.linalg.det(turn) > 0):
         raise ValueError(f"`rotation` of {entry['img_name']} is no rotation")
-    if not (min(numbers) > 0 and min(width, height) > 0):
+    if not (min(numbers[:2]) > 0 and min(width, height) > 0):
         raise ValueError(f"`width`, `height`, `fx` and `fy` of {entry['img_name']} must be above 0")
-    return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width / 2, height / 2, width, height)
+    return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width, height)
+
+
+def cameras_content(cameras: Sequence[Camera]) -> List[Dict[str, Any]]:
+    """What `cameras.json` holds of cameras, for viewers of 3DGS and for `read_model_layout`."""
+    return [{"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height,
+             "position": camera.center.tolist(), "rotation": camera.rotation.T.tolist(), "fx": camera.fx,
+             "fy": camera.fy, "cx": camera.cx, "cy": camera.cy} for index, camera in enumerate(cameras)]
 
 
 @torch.no_grad()

@@ -177,6 +177,26 @@ def test_without_photographs_a_model_is_its_own_teacher(run, tmp_path, capsys):
     assert "--loses compares with photographs" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
+def test_a_run_whose_scene_is_gone_is_its_own_teacher(run, tmp_path):
+    """By the cameras.json that it has written: sizes and principal points are those of its images."""
+    scene = shifted_scene(run.scene, str(tmp_path / "scene"), 1.5)
+    config = run.changed(scene=scene, init=ply_of(run), iterations=4, densify_until_iter=0,
+                         output=str(tmp_path / "run"))
+    train(config, progress=False)
+    photographs = load_scene(config, progress=False)
+    shutil.rmtree(scene)
+    row = simplify(config.output, str(tmp_path / "out"), budget=40, **SHORT)
+    assert (row["protocol"]["scene_kind"], row["protocol"]["image_size"]) == ("model", [30, 22])
+    rendered = load_scene(TrainConfig.load(str(tmp_path / "out")), progress=False)
+    for mine, theirs in ((rendered.train, photographs.train), (rendered.test, photographs.test)):
+        assert [view.camera.name for view in mine] == [view.camera.name for view in theirs]
+        for view, photograph in zip(mine, theirs):
+            for name in ("fx", "fy", "cx", "cy", "width", "height"):
+                assert getattr(view.camera, name) == getattr(photograph.camera, name)
+            assert np.allclose(view.camera.rotation, photograph.camera.rotation, atol=1e-12)
+            assert np.allclose(view.camera.translation, photograph.camera.translation, atol=1e-12)
+
+
 def test_a_model_folder_says_where_and_how_it_was_trained(run, tmp_path):
     (tmp_path / "model").mkdir()
     text = (f"Namespace(sh_degree=3, source_path={run.scene!r}, model_path='x', images='images', resolution=30, "
