@@ -6,7 +6,7 @@ import dataclasses
 import os
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Sequence
+from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Optional, Sequence
 
 import numpy as np
 import torch
@@ -21,7 +21,15 @@ from .export.splat import splat_gaussians
 from .export.spz import spz_gaussians
 from .model import GaussianModel, finite_rows
 from .results.evaluation import evaluate
-from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, model_path, raw_of, read_ply
+from .results.modelfile import (
+    Recorded,
+    agreed_background_gate,
+    agreed_blend_mode,
+    model_path,
+    raw_of,
+    read_ply,
+    recorded_faint,
+)
 from .results.pictures import evenly_spaced
 from .results.rendering import Renderer, background_color
 from .scenes.images import View
@@ -47,6 +55,7 @@ class Start:
     gaussians: io.Gaussians
     blend_mode: str
     background_gate: float
+    faint_below: Optional[float] = None  # as usual
 
     @property
     def count(self) -> int:
@@ -107,7 +116,8 @@ def read_start(path: str) -> Start:
         raise TrainerError(f"{path}: {what}; `dsmoe export MODEL -o clean.glb` leaves such Gaussians out")
     recorded = Recorded(gaussians.blend_mode, gaussians.background_gate)
     mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")
-    return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None))
+    return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None),
+                 recorded_faint(path, gaussians.comments))
 
 
 def find_model(source: str) -> Found:
@@ -176,8 +186,11 @@ def blend_options(start: Start, given: Dict[str, Any]) -> Dict[str, Any]:
     """Options of a training from the model, beside given ones: its blend, and a learned gate begins with its gate."""
     mode = given.get("blend_mode") or start.blend_mode
     options: Dict[str, Any] = {"blend_mode": mode}
-    is_learned = given.get("background_gate", LEARNED) == LEARNED
-    if mode == start.blend_mode and mode in GATED_MODES and is_learned and "background_gate_start" not in given:
+    if mode != start.blend_mode or mode not in GATED_MODES:
+        return options
+    if start.faint_below is not None:
+        options["faint_below"] = given.get("faint_below", start.faint_below)
+    if given.get("background_gate", LEARNED) == LEARNED and "background_gate_start" not in given:
         bound = given.get("background_gate_bound", learned_gate_of(mode)["background_gate_bound"])
         options["background_gate_start"] = max(start.background_gate, bound + LEAST_ABOVE_BOUND)
     return options
@@ -187,7 +200,7 @@ def start_renderer(start: Start, config: TrainConfig) -> Renderer:
     """Renders the model as it was trained, on config.device."""
     model = GaussianModel.from_gaussians(raw_of(start.gaussians, config.device), start.gaussians.sh_degree)
     return Renderer(model, start.blend_mode, background_color(config.white_background, config.device),
-                    config.antialiasing, background_gate=start.background_gate)
+                    config.antialiasing, background_gate=start.background_gate, faint_below=start.faint_below)
 
 
 def check_start(scene: Scene, config: TrainConfig) -> Quality:

@@ -89,16 +89,11 @@ def cameras_content(cameras: Sequence[Camera]) -> List[Dict[str, Any]]:
 @torch.no_grad()
 def rendered_views(model: str, images: Sequence[PosedImage], config: TrainConfig) -> List[View]:
     """What a model shows at the cameras, in 8 bits, on config.device, by its own blend. Raises TrainerError."""
-    from ..model import GaussianModel
     from ..results.metrics import quantised
-    from ..results.modelfile import raw_of
-    from ..results.rendering import Renderer, background_color
-    from ..starting import read_start
+    from ..starting import read_start, start_renderer
 
     start = read_start(model)
-    gaussians = GaussianModel.from_gaussians(raw_of(start.gaussians, config.device), start.gaussians.sh_degree)
-    renderer = Renderer(gaussians, start.blend_mode, background_color(config.white_background, config.device),
-                        config.antialiasing, background_gate=start.background_gate)
+    renderer = start_renderer(start, config)
     checksum = hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in (
         start.gaussians.means3D, start.gaussians.dc, start.gaussians.opacity_logits))).hexdigest()
     views = []
