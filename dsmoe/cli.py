@@ -59,7 +59,8 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
+        trains = arguments.command in ("train", "simplify")
+        continues = trains and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = f"; continue it with: {_resume_command(arguments.output)}" if continues else ""
         if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
@@ -216,6 +217,30 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     print(f"to look at it in a browser: {command()} export {shlex.quote(config.output)} -o model.html")
 
 
+def _simplify(arguments: argparse.Namespace) -> None:
+    from .results.modelfile import model_path
+    from .results.rows import results_table, viewer_warning
+    from .simplify import simplify
+    from .system.process import command, set_up_process
+
+    arguments.device = getattr(arguments, "device", "auto")
+    _choose_device(arguments)
+    set_up_process(arguments.device)
+    given = {name: value for name, value in given_options(arguments).items()
+             if name not in ("scene", "output", "budget")}
+    row = simplify(arguments.model, arguments.output, scene=arguments.scene, budget=arguments.budget,
+                   keep=arguments.keep, loses=arguments.loses, resume=arguments.resume, overwrite=arguments.overwrite,
+                   progress=not arguments.quiet, say=lambda text: print(text, flush=True), **given)
+    print(results_table([row["start"], row]))
+    if row["protocol"]["scene_kind"] == "model":
+        print("measured against renderings of the model: there are no photographs")
+    if viewer_warning(row):
+        print(viewer_warning(row))
+    path = model_path(arguments.output, row["protocol"]["iterations"])
+    print(f"model: {printable(path)}, {os.path.getsize(path) / 1e6:.1f} MB of {row['start']['bytes'] / 1e6:.1f} MB")
+    print(f"for the web: {command()} export {shlex.quote(arguments.output)} -o model.spz")
+
+
 def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     """The options of a training: those that are given, and for --resume the run's own."""
     take_paper(arguments)
@@ -234,9 +259,20 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
 
         earlier = TrainConfig.load(run).device if arguments.resume and holds_run(run) else None
         given["device"] = arguments.device = earlier or chosen_device()
+    if given.get("init"):
+        _start_from(arguments)
     if not arguments.resume or "scene" in given and (presets or not holds_run(run)):
         return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
+
+
+def _start_from(arguments: argparse.Namespace) -> None:
+    """--init becomes the model's file, and the blend is its own unless another one is asked for."""
+    from .starting import blend_options, find_model, read_start
+
+    arguments.init = find_model(arguments.init).path
+    for name, value in blend_options(read_start(arguments.init), given_options(arguments)).items():
+        setattr(arguments, name, value)
 
 
 def _scene(arguments: argparse.Namespace) -> None:
@@ -362,5 +398,6 @@ def _completion(arguments: argparse.Namespace) -> None:
     print(completion_script(arguments.shell))
 
 
-COMMANDS = {"train": _train, "scene": _scene, "eval": _eval, "render": _render, "export": _export, "view": _view,
-            "patch": _patch, "run": _run, "bench": _bench, "info": _info, "completion": _completion}
+COMMANDS = {"train": _train, "simplify": _simplify, "scene": _scene, "eval": _eval, "render": _render,
+            "export": _export, "view": _view, "patch": _patch, "run": _run, "bench": _bench, "info": _info,
+            "completion": _completion}

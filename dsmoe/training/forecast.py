@@ -20,7 +20,9 @@ class Forecast:
         self.config = config
         camera = scene.train[0].camera
         chosen = short_run("cpu", camera.width, camera.height, len(scene.points.positions))
-        self.shorter = chosen if config.iterations > chosen["iterations"] or len(chosen) > 3 else {}
+        self.removes = scene.start is not None and 0 < config.budget < len(scene.points.positions)
+        is_long = config.iterations > chosen["iterations"] or len(chosen) > 3
+        self.shorter = chosen if is_long and not self.removes else {}
         self.begun: Optional[float] = None
         self.first = 0
         self.said = False
@@ -42,8 +44,8 @@ class Forecast:
 
     def text(self, left: int, seconds: float) -> str:
         """left: iterations."""
-        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, longer as Gaussians are "
-                "added")
+        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, "
+                + ("less as Gaussians are removed" if self.removes else "longer as Gaussians are added"))
         if seconds < LONG_SECONDS or not self.shorter:
             return line
         options = f"--overwrite --scale-recipe {flags_text(self.shorter)}"
