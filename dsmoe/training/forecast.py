@@ -5,8 +5,9 @@ import time
 from typing import Optional
 
 from ..config import TrainConfig, flags_text
+from ..presets import FAST
 from ..scenes.scene import Scene
-from ..short_run import short_run
+from ..short_run import FLAG, smaller_images
 
 STEPS = 10  # that are measured, behind the first one, which is slower
 ENOUGH_SECONDS = 20.0  # or as many steps as take so long
@@ -19,8 +20,9 @@ class Forecast:
     def __init__(self, config: TrainConfig, scene: Scene) -> None:
         self.config = config
         camera = scene.train[0].camera
-        chosen = short_run("cpu", camera.width, camera.height, len(scene.points.positions))
-        self.shorter = chosen if config.iterations > chosen["iterations"] or len(chosen) > 3 else {}
+        smaller = smaller_images(camera.width, camera.height)
+        is_short = config.iterations <= FAST["cpu"].iterations and not smaller
+        self.shorter = "" if is_short else f"{FLAG} {flags_text(smaller)}".rstrip()
         self.begun: Optional[float] = None
         self.first = 0
         self.said = False
@@ -46,8 +48,7 @@ class Forecast:
                 "added")
         if seconds < LONG_SECONDS or not self.shorter:
             return line
-        options = f"--overwrite --scale-recipe {flags_text(self.shorter)}"
-        return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: {options}"
+        return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: --overwrite {self.shorter}"
 
 
 def duration(seconds: float) -> str:
