@@ -172,8 +172,8 @@ def test_the_words_of_the_kernels_name_what_the_code_has(stage):
 
 def test_the_page_of_settings_has_every_variable():
     read = set()
-    for name in ("dsmoe", "diff_smoe_rasterization", "patches", "integrations", "setup.py", "tests", "build_support",
-                 "quickstart", "check", "docs"):
+    for name in ("dsmoe", "benchmarks/harness", "diff_smoe_rasterization", "patches", "integrations", "setup.py",
+                 "tests", "build_support", "quickstart", "check", "docs"):
         for path in [ROOT / name] if (ROOT / name).is_file() else (ROOT / name).rglob("*"):
             if path.suffix in (".py", ".cpp", ".yaml") or not path.suffix and path.is_file():
                 text = path.read_text(encoding="utf-8", errors="replace")
