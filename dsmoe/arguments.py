@@ -8,18 +8,20 @@ from typing import Any, Iterator, List, Tuple
 from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.settings import BLEND_MODES, PAPER_PROGRAM
 
-from . import choices, fast
+from . import choices
 from .bench.names import SCENES, SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
 from .config import PRINCIPAL_POINTS, TrainConfig
 from .config_arguments import add_arguments, number, whole_number
 from .patches import TRAINERS
+from .presets import BEST, FAST
 
 TRAIN_EXAMPLES = """examples:
-  dsmoe train garden -o garden_model                              the recipe of 3DGS
-  dsmoe train garden -o small --blend-mode smoe --budget 30000    a model of 30,000 Gaussians
-  dsmoe train garden -o fast --blend-mode smoe --fast             a result in seconds
-  dsmoe train garden -o quick --iterations 3000 --scale-recipe --resolution 4    minutes on a processor"""
+  dsmoe train garden -o garden_model                              as many Gaussians as the scene needs
+  dsmoe train garden -o small --blend-mode smoe --budget 30000    30,000 Gaussians
+  dsmoe train garden -o fast --fast                               in seconds on a GPU
+  dsmoe train garden -o quick --fast --resolution 4               in minutes on a processor
+  dsmoe train garden -o recipe --strategy 3dgs                    the recipe of 3DGS"""
 
 
 # Options of a training that `dsmoe simplify` offers as they are.
@@ -48,12 +50,16 @@ def build_parser() -> argparse.ArgumentParser:
     groups["length, and number of Gaussians"].add_argument(
         "--scale-recipe", action="store_true",
         help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
-             "keep their share of 30,000 steps, unless they are given")
-    groups["length, and number of Gaussians"].add_argument(
+             "keep their share of 30,000 steps, unless they are given; importance does so by itself")
+    presets = groups["length, and number of Gaussians"].add_mutually_exclusive_group()
+    presets.add_argument(
         "--fast", action="store_true",
-        help=f"a result in seconds on a GPU: {fast.ITERATIONS} iterations of the strategy importance, with early "
-             f"milestones; without --budget {fast.PER_POINT} Gaussians for each point of the scene, {fast.LEAST} to "
-             f"{fast.MOST}. Options that are given win")
+        help=f"a result in seconds on a GPU, by {FAST['cuda'].iterations} iterations with early milestones, or in "
+             f"minutes on a CPU, by {FAST['cpu'].iterations}. Options that are given win")
+    presets.add_argument(
+        "--best", action="store_true",
+        help=f"{BEST.iterations} iterations, and decisions that look at more views: better where the training views "
+             "gain too")
     earlier_run = groups["run"].add_mutually_exclusive_group()
     earlier_run.add_argument("--resume", action="store_true",
                              help="continue the run in OUT from its last checkpoint with its own options; more "

@@ -14,6 +14,7 @@ from .config_arguments import config_from_arguments, given_options, take_paper
 from .early import check_early
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .patches import PatchError
+from .presets import STRATEGY
 from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
 from .system.process import command
@@ -204,11 +205,16 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
+    if config.strategy == STRATEGY and not arguments.resume and "budget" not in given_options(arguments):
+        print("note: that number is chosen for the scene; --budget N makes more or fewer, and --strategy 3dgs is the "
+              "recipe of 3DGS")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
                 say=lambda text: print(text, flush=True))
     print(results_table([row]))
+    if row["psnr_train"] is not None:
+        print(f"the training views have {row['psnr_train']:.2f} dB")
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
     if viewer_warning(row):
@@ -250,7 +256,8 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
         del arguments.scene
     if not given.get("output") or not given.get("scene") and not arguments.resume:
         arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs only OUT")
-    presets = ["--fast"] * arguments.fast + ["--scale-recipe"] * arguments.scale_recipe
+    presets = [f"--{name}" for name in ("fast", "best") if getattr(arguments, name)]
+    presets += ["--scale-recipe"] * arguments.scale_recipe
     if arguments.resume and presets and "scene" not in given:
         arguments.command_parser.error(f"{presets[0]} needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")

@@ -62,6 +62,8 @@ class GateOptions(NamedTuple):
 class TrainConfig:
     """Options of one training run; defaults are those of 3D Gaussian Splatting (the 2023 release).
 
+    The command `dsmoe train` has another default: the strategy importance (`config_arguments.py`).
+
     Raises ConfigError from `validate` with the option's name, its value and what it must be.
     """
 
@@ -104,11 +106,13 @@ class TrainConfig:
         "", "start from the Gaussians of a model, in place of the scene's points: a .ply, .splat, .spz or .glb, an "
             "output folder of `dsmoe train` or a model folder of 3DGS. --blend-mode is then the model's by default",
         metavar="MODEL")
-    budget: int = _option(0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed; 0: none")
+    budget: int = _option(
+        0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed (default: importance chooses it "
+           "for the scene)")
     strategy: Optional[str] = _option(
         None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
               "prune; importance: grow beyond the budget, remove what changes the images least, move the rest to where "
-              "the error is; mcmc: relocation and noise (default: importance with --budget, else 3dgs)",
+              "the error is; mcmc: relocation and noise (default: importance)",
         choices=STRATEGY_NAMES)
     strategy_options: str = _option("", "settings of `importance`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
@@ -188,10 +192,9 @@ class TrainConfig:
         if self.strategy == "importance":
             self.importance_options()
             self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy importance; "
-                          "--scale-recipe makes it half of --iterations")
+                          "left out it is half of --iterations")
             self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter, "
-                          f"{self.densify_until_iter}, with --strategy importance, whose removals end there; "
-                          "--scale-recipe shortens all of it")
+                          f"{self.densify_until_iter}, with --strategy importance, whose removals end there")
         self._require("strategy_options", not self.strategy_options or self.strategy == "importance",
                       f"left out with --strategy {self.strategy}: only importance has some")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
@@ -268,7 +271,7 @@ class TrainConfig:
                          f"{self.densify_from_iter}; --scale-recipe squeezes the recipe into so few")
         if self.strategy == "importance" and 4 * self.densify_until_iter >= 3 * self.iterations:
             notes.append(f"--densify-until-iter {self.densify_until_iter} leaves no iterations to settle; below three "
-                         "quarters of --iterations it does, and --scale-recipe makes it half of them")
+                         "quarters of --iterations it does; left out it is half of them")
         return notes
 
     def shortened(self) -> TrainConfig:
@@ -281,6 +284,8 @@ class TrainConfig:
         milestones = {name: max(1, round(getattr(default, name) * share)) for name in (
             "position_lr_max_steps", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
             "opacity_reset_interval")}
+        if self.strategy == "importance":
+            milestones["densify_until_iter"] = max(2, milestones["densify_until_iter"])
         fitting = max(1, milestones["densify_until_iter"] // 10)
         milestones["densification_interval"] = min(default.densification_interval, fitting)
         return dataclasses.replace(self, **{name: value for name, value in milestones.items()

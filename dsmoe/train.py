@@ -130,7 +130,8 @@ class Run:
             save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate,
                        config.faint_below)
         evaluation = trainer.evaluate(self.progress)
-        row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation, gate)
+        row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation,
+                         trainer.evaluate_training_views(self.progress), gate)
         if not trainer.leads:
             return row
         write_results(os.path.dirname(self._path(RESULTS_NAME)), [row])

@@ -12,6 +12,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import numpy as np
 import torch
 
+from ..config import TrainConfig
 from ..errors import ConfigError
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
@@ -51,6 +52,21 @@ CHILD_SCALE = 0.65
 CHILD_COVER = 0.744
 
 
+def reached_from(config: TrainConfig, start: int) -> int:
+    """How many Gaussians growth can make of so many: a densification doubles at most."""
+    return start * 2**_densifications(config, config.densify_from_iter)
+
+
+def _growth_end(config: TrainConfig) -> int:
+    return round(GROWTH_ENDS * config.densify_until_iter)
+
+
+def _densifications(config: TrainConfig, behind: int) -> int:
+    """How many densifications of growth come behind an iteration."""
+    return sum(is_due(iteration, config.densification_interval, config.batch)
+               for iteration in range(config.batch, _growth_end(config), config.batch) if iteration > behind)
+
+
 class ImportanceStrategy(SteadyStrategy):
     """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
 
@@ -62,7 +78,7 @@ class ImportanceStrategy(SteadyStrategy):
         self.start = context.num_gaussians
         until = config.densify_until_iter
         is_enough = bool(config.init) and self.start >= config.budget
-        self.growth_ends = 0 if is_enough else round(GROWTH_ENDS * until)
+        self.growth_ends = 0 if is_enough else _growth_end(config)
         begin = REMOVALS_BEGIN_FROM_MODEL if is_enough else REMOVALS_BEGIN
         count = self.options.removals
         last = config.iterations - config.batch  # the last step changes nothing
@@ -80,20 +96,14 @@ class ImportanceStrategy(SteadyStrategy):
         self._check_reach()
 
     def _check_reach(self) -> None:
-        """Raises ConfigError if growth cannot lead to the budget: a densification doubles at most."""
+        """Raises ConfigError if growth cannot lead to the budget."""
         config = self.context.config
-        most = self.start * 2**self._densifications(config.densify_from_iter)
+        most = reached_from(config, self.start)
         if most < config.budget:
             raise ConfigError(f"--budget is {config.budget}; it must be at most {most}: that is what {self.start} "
                               "points reach with one densification each --densification-interval "
                               f"{config.densification_interval} between --densify-from-iter "
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
-
-    def _densifications(self, behind: int) -> int:
-        """How many densifications come behind an iteration."""
-        config = self.context.config
-        return sum(is_due(iteration, config.densification_interval, config.batch)
-                   for iteration in range(config.batch, self.growth_ends, config.batch) if iteration > behind)
 
     def _find_free_space(self) -> None:
         """Around each training camera is a ball in which nothing can be, as the points of the scene begin behind it."""
@@ -157,7 +167,7 @@ class ImportanceStrategy(SteadyStrategy):
     def growth(self, iteration: int) -> Tuple[int, Optional[int]]:
         """At least what reaches the budget and at most what reaches the overshoot, in equal steps."""
         config, now = self.context.config, self.context.num_gaussians
-        steps = 1 + self._densifications(iteration)
+        steps = 1 + _densifications(config, iteration)
         least = -(-max(0, config.budget - now) // steps)
         if self.options.overshoot == 0:
             return least, None

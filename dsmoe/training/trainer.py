@@ -1,7 +1,7 @@
 """A training run over a loaded scene: its state, and one step after the other."""
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, List, Optional, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
@@ -11,8 +11,8 @@ from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
 from ..model import GaussianModel
 from ..optimizer import GaussianOptimizer
-from ..results.evaluation import Evaluation, evaluate
-from ..results.metrics import psnr
+from ..results.evaluation import PASSES, Evaluation, Measure, evaluate, psnr_alone
+from ..results.metrics import image_metrics, psnr
 from ..results.modelfile import raw_of
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..scenes.images import View
@@ -203,7 +203,14 @@ class Trainer:
 
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views."""
-        return evaluate(self.result(), self.scene.test, self.config.device, progress)
+        return self._evaluate(self.scene.test, progress, image_metrics, PASSES)
+
+    def evaluate_training_views(self, progress: bool = False) -> Optional[float]:
+        """Their mean PSNR. Where it rises and that of the test views does not, a longer training only overfits."""
+        return self._evaluate(self.scene.train, progress, psnr_alone, 1).metrics["psnr"]
+
+    def _evaluate(self, views: Sequence[View], progress: bool, measure: Measure, passes: int) -> Evaluation:
+        return evaluate(self.result(), views, self.config.device, progress, measure, passes)
 
     def state_dict(self) -> Dict[str, Any]:
         """Everything the rest of the run depends on, as tensors and plain values."""
