@@ -2,13 +2,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import Iterator, List, Tuple
+from typing import Any, Iterator, List, Tuple
 
 from diff_smoe_rasterization._version import __version__
-from diff_smoe_rasterization.settings import BLEND_MODES
+from diff_smoe_rasterization.settings import BLEND_MODES, PAPER_PROGRAM
 
 from . import choices, fast
-from .bench.names import SELECTORS, SHIPPED
+from .bench.names import SCENES, SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
 from .config import PRINCIPAL_POINTS
 from .config_arguments import add_arguments, number, whole_number
@@ -37,6 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
                             "NeRF-synthetic scene; --resume finds it in OUT")
     train.add_argument("-o", "--output", metavar="OUT", default=argparse.SUPPRESS, help="folder to write")
     groups = add_arguments(train, skip=("scene", "output"))
+    _add_paper(groups["blending"])
     groups["length, and number of Gaussians"].add_argument(
         "--scale-recipe", action="store_true",
         help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
@@ -145,11 +146,13 @@ def build_parser() -> argparse.ArgumentParser:
     _add_patch_arguments(patch)
 
     run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
-                              usage="dsmoe run --blend-mode MODE [--background-gate V] [--trainer NAME] -- COMMAND ...",
+                              usage="dsmoe run (--paper | --blend-mode MODE) [OPTION ...] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
+    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES,
                      help="nothing records it: give the same where a trained model is rendered")
+    _add_paper(run)
+    run.add_argument("--faint-below", "--faint_below", type=number, metavar="X", help="as in train")
     run.add_argument("--background-gate", "--background_gate", metavar="V",
                      help="how much the background weighs: a number, 0 in the paper, or `learned` (default: "
                           "$DSMOE_BACKGROUND_GATE, else learned in smoe, 0 in smoe_eq7); models record it. smoe with "
@@ -174,6 +177,12 @@ def build_parser() -> argparse.ArgumentParser:
     for command in (train, scene, evaluate, render, export, view, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
+
+
+def _add_paper(parser: Any) -> None:
+    parser.add_argument("--paper", action="store_true",
+                        help="blend as the program of the paper's authors: " + " ".join(
+                            f"--{name.replace('_', '-')} {value}" for name, value in PAPER_PROGRAM.items()))
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -219,6 +228,10 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--device", choices=choices.DEVICES,
                      help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
+    run.add_argument("--iterations", type=whole_number, metavar="N",
+                     help="a trial: so many iterations, with the recipe squeezed into them; not for checkouts")
+    run.add_argument("--scenes", metavar="SCENES",
+                     help=f"in place of the suite's: a .yaml file, or a shipped one: {', '.join(sorted(SCENES))}")
     run.add_argument("--jobs", type=whole_number, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
                           "FPS stay out of the report)")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Dict, List, Optional
 
 from .arguments import build_parser, completion_script
 from .config import CHECKPOINT_NAME, TrainConfig, holds_run
-from .config_arguments import config_from_arguments, given_options
+from .config_arguments import config_from_arguments, given_options, take_paper
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .patches import PatchError
 from .system.files import is_folder
@@ -81,7 +81,8 @@ def _bench_run(arguments: argparse.Namespace) -> int:
 
     rows = run_suite(arguments.suite, results=arguments.output, jobs=arguments.jobs, slurm=arguments.slurm,
                      retry_failed=arguments.retry_failed, dry_run=arguments.dry_run, only=arguments.only,
-                     per_gpu=arguments.per_gpu, rows=arguments.rows, device=arguments.device)
+                     per_gpu=arguments.per_gpu, rows=arguments.rows, device=arguments.device,
+                     iterations=arguments.iterations, scenes=arguments.scenes)
     if rows:
         print(rows_table(rows))
     failed = sum(not row["ok"] for row in rows)
@@ -110,7 +111,10 @@ def _run(arguments: argparse.Namespace) -> None:
     from .patches.run import run
 
     words = arguments.words[1:] if arguments.words[:1] == ["--"] else arguments.words
-    run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate)
+    take_paper(arguments)
+    if not arguments.blend_mode:
+        arguments.command_parser.error("--blend-mode MODE or --paper is needed")
+    run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate, arguments.faint_below)
 
 
 def _train(arguments: argparse.Namespace) -> Optional[int]:
@@ -160,7 +164,7 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
         train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
         return
     print(device_line(config.device), flush=True)
-    blend = blend_name(config.blend_mode, config.background_gate)
+    blend = blend_name(config.blend_mode, config.background_gate, config.faint_below)
     budget = f" to {config.budget} Gaussians" if config.budget else ""
     batch = f", {config.batch} views a step" if config.batch > 1 else ""
     processes = f", in {group.size} processes" if group.size > 1 else ""
@@ -184,6 +188,7 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
 
 def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     """The options of a training: those that are given, and for --resume the run's own."""
+    take_paper(arguments)
     given = given_options(arguments)
     if arguments.resume and set(given) & {"scene", "output"} == {"scene"}:  # dsmoe train --resume OUT
         given["output"] = arguments.output = given.pop("scene")

@@ -11,11 +11,13 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 from diff_smoe_rasterization.settings import (
     BACKGROUND_GATE_VARIABLE,
     BLEND_MODES,
+    FAINT_BELOW_VARIABLE,
     GATED_MODES,
     LEARNED,
     MAX_BACKGROUND_GATE,
     resolve_background_gate,
     resolve_blend_mode,
+    resolve_faint_below,
 )
 
 from .choices import DEVICES
@@ -75,6 +77,10 @@ class TrainConfig:
     background_gate_start: float = _varied("a learned background gate starts with this", 1.0, smoe=0.1)
     background_gate_lr: float = _varied(
         "learning rate of the logarithm of what a learned background gate has above its bound", 0.01, smoe=0.03)
+    faint_below: Optional[float] = _option(
+        None, "smoe, smoe_eq7: where near pairs have a gate sum below this, faint pairs and tails count too; 2: "
+              "everywhere, as in the program of the paper's authors (default: $DSMOE_FAINT_BELOW, else 0.25 in smoe, 2 "
+              "in smoe_eq7)")
     iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
@@ -141,6 +147,7 @@ class TrainConfig:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
+            self.faint_below = _training_faint(self.blend_mode, self.faint_below)
             if self.strategy is None:
                 self.strategy = "importance" if self.budget else "3dgs"
             for name, value in {**_recipe_of(self.strategy), **learned_gate_of(self.blend_mode)}.items():
@@ -223,15 +230,16 @@ class TrainConfig:
     def changed(self, **options: Any) -> TrainConfig:
         """A validated copy with some options set.
 
-        Another blend mode brings its default gate, and its defaults of learning one in place of the old mode's. Another
-        strategy brings its defaults of the recipe in place of the old one's, and drops the old one's own options.
+        Another blend mode brings its default gate and `faint_below`, and its defaults of learning one in place of the
+        old mode's. Another strategy brings its defaults of the recipe in place of the old one's, and drops the old
+        one's own options.
         """
         return self._changed(options).validate()
 
     def _changed(self, options: Dict[str, Any]) -> TrainConfig:
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             usual = learned_gate_of(str(self.blend_mode))
-            options = {"background_gate": None, **self._unset(usual), **options}
+            options = {"background_gate": None, "faint_below": None, **self._unset(usual), **options}
         if options.get("strategy", self.strategy) != self.strategy:
             usual = _recipe_of(str(self.strategy))
             options = {**self._unset(usual), "strategy_options": "", **options}
@@ -404,6 +412,16 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     if (os.environ.get(BACKGROUND_GATE_VARIABLE) or LEARNED if asked is None else asked) == LEARNED:
         return LEARNED
     return float(resolve_background_gate(blend_mode, asked))
+
+
+def _training_faint(blend_mode: str, asked: Optional[float]) -> Optional[float]:
+    """The `faint_below` that a training takes and records; None: the mode's own. Raises ValueError."""
+    if blend_mode not in GATED_MODES:
+        if asked is not None:
+            raise ValueError(f"--faint-below is {asked!r}, but the blend mode is {blend_mode}; only "
+                             f"{' and '.join(GATED_MODES)} know it")
+        return None
+    return resolve_faint_below(blend_mode, asked) if asked is not None or os.environ.get(FAINT_BELOW_VARIABLE) else None
 
 
 def flags_of(option: dataclasses.Field[Any]) -> Sequence[str]:

@@ -5,7 +5,7 @@ import argparse
 import dataclasses
 from typing import Any, Callable, Dict, Optional, Sequence, Union
 
-from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES
+from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, PAPER_PROGRAM
 
 from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
 from .errors import ConfigError
@@ -15,7 +15,7 @@ from .fast import budget_of, with_preset
 GROUPS = {
     "scene": ("images", "strict", "resolution", "test_every", "principal_point", "init_points", "white_background",
               "random_background"),
-    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
+    "blending": ("blend_mode", "background_gate", "background_gate_bound", "faint_below", "antialiasing"),
     "length, and number of Gaussians": ("iterations", "batch", "budget", "strategy", "strategy_options"),
     "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
     "recipe": (),
@@ -43,7 +43,7 @@ def _number_or_learned(text: str) -> Union[float, str]:
     return text if text == LEARNED else _typed(float, text, f"{KINDS[float]} or `{LEARNED}`")
 
 
-_TYPES = {"int": whole_number, "float": number, "str": str, "Optional[str]": str,
+_TYPES = {"int": whole_number, "float": number, "str": str, "Optional[str]": str, "Optional[float]": number,
           "Union[float, str, None]": _number_or_learned}
 
 
@@ -76,10 +76,19 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         if option.metadata.get("choices"):
             keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
         else:
-            letter = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+            letter = "N" if option.type == "int" else "X" if "float" in str(option.type) else "NAME"
             keywords["metavar"] = option.metadata.get("metavar", letter)
         group.add_argument(*flags, help=text, dest=option.name, **keywords)
     return groups
+
+
+def take_paper(arguments: argparse.Namespace) -> None:
+    """Sets the options that --paper stands for. Raises ConfigError if one is given and is another."""
+    for name, value in PAPER_PROGRAM.items() if arguments.paper else ():
+        given = getattr(arguments, name, None)
+        if given not in (None, value) and str(given) != str(value):
+            raise ConfigError(f"--{name.replace('_', '-')} is {given!r}; with --paper it is {value!r}, or left out")
+        setattr(arguments, name, value)
 
 
 def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:

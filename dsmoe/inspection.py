@@ -84,7 +84,7 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
     gate = agreed_background_gate(ply, mode, recorded, asked_gate)
     return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
-                    background_gate=gate)
+                    background_gate=gate, faint_below=recorded.faint_below)
 
 
 class OpenedRun(NamedTuple):
@@ -116,7 +116,7 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
           f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
     renderer = Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
-                        rasterize, background_gate=gate)
+                        rasterize, background_gate=gate, faint_below=config.faint_below)
     return OpenedRun(renderer, so_far.path, so_far)
 
 

@@ -69,9 +69,9 @@ class Run:
         with damage_named(path):
             state = load_checkpoint(path, self.trainer.checkpoint_device)
             self.trainer.check_state(state)
-            self.trainer.load_state_dict(state)
-            self.history = list(state["history"])
-            self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
+        self.trainer.load_state_dict(state)
+        self.history = list(state["history"])
+        self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
@@ -124,7 +124,8 @@ class Run:
         trainer, config = self.trainer, self.trainer.config
         gate, model = trainer.background_gate, trainer.whole_model()
         if trainer.leads:
-            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate)
+            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate,
+                       config.faint_below)
         evaluation = trainer.evaluate(self.progress)
         row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation, gate)
         if not trainer.leads:

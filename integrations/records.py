@@ -70,8 +70,8 @@ def _wrap(owner: Any, name: str, before: Optional[Callable[..., None]] = None,
 
 
 def recorded() -> Dict[str, Any]:
-    """Returns blend_mode and background_gate of this process; {} in modes without such a gate."""
-    mode, background_gate = settings.blend_of_process or (settings.resolve_blend_mode(None), None)
+    """Returns blend_mode and background_gate of this process, and an unusual faint_below; {} in ungated modes."""
+    mode, background_gate = (settings.blend_of_process or (settings.resolve_blend_mode(None), None))[:2]
     if gate.blend_mode:
         mode, background_gate = gate.blend_mode, settings.LEARNED
     if mode not in settings.GATED_MODES:
@@ -80,7 +80,9 @@ def recorded() -> Dict[str, Any]:
     is_learned = isinstance(background_gate, str)
     if is_learned and not (gate.blend_mode and gate.is_known):
         return {}  # nothing was rendered with it
+    faint = settings.resolve_faint_below(mode, None)
     return {"blend_mode": mode, "background_gate": gate.value() if is_learned else background_gate,
+            **({} if faint == settings.usual_faint_below(mode) else {"faint_below": faint}),
             **({"learned": gate.state_dict()} if is_learned and not gate.frozen else {})}
 
 
@@ -128,11 +130,11 @@ def _take(file: Any, is_model: bool) -> None:
 def _record_ply(ply: Any, *_: Any, **__: Any) -> None:
     if not _has_gaussians(ply):
         return
-    ours = ("blend_mode ", "background_gate ")
+    ours = ("blend_mode ", "background_gate ", "faint_below ")
     record = recorded()
     if record:
         ply.comments = [line for line in ply.comments if not line.startswith(ours)] + [
-            f"{name}{record[name.strip()]}" for name in ours]
+            f"{name}{record[name.strip()]}" for name in ours if name.strip() in record]
 
 
 def _take_ply(ply: Any, arguments: Sequence[Any]) -> Any:
@@ -163,7 +165,7 @@ def _found(file: Any, record: Optional[Dict[str, Any]], is_model: bool) -> None:
 
     While the gate is learned, only a model brings another: other files of the training record it too.
     """
-    mode, background_gate = settings.blend_of_process or (settings.resolve_blend_mode(None), None)
+    mode, background_gate = (settings.blend_of_process or (settings.resolve_blend_mode(None), None))[:2]
     name = file if _is_path(file) else "the model"
     if record and (is_model or not gate.learns):
         gate.found(float(record["background_gate"]), record.get("learned"))

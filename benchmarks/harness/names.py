@@ -6,16 +6,18 @@ import os
 from pathlib import Path
 from typing import Any, Mapping, Sequence, Union
 
-from diff_smoe_rasterization.settings import GATED_MODES
+from diff_smoe_rasterization.settings import EVERYWHERE, GATED_MODES, PAPER, PAPER_PROGRAM
 
 from ..config import RECIPE as TRAINER_RECIPE
 from .errors import BenchError
 
 SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}  # suites, by name
+SCENES = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("scenes/*.yaml")}
 # The axes of a suite (schema.py), and what a cell calls its value.
-AXIS_OF = {"blend_modes": "blend_mode", "background_gates": "background_gate",
+AXIS_OF = {"blend_modes": "blend_mode", "background_gates": "background_gate", "faint_belows": "faint_below",
            "densify_grad_thresholds": "densify_grad_threshold", "strategies": "strategy", "budgets": "budget",
            "seeds": "seed"}
+UNSAID = {"faint_below": None, "budget": 0}  # what cells without such a field have; their names are older than it
 SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")  # fields by which `--only` chooses cells
 NATIVE = "native"
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
@@ -55,11 +57,19 @@ def read_json(path: Union[str, Path]) -> Any:
 
 
 def blend_of(row: Mapping[str, Any]) -> str:
-    """Such as "smoe 0.05" or "smoe learned"; rows that say no gate are of 0."""
-    gate = row.get("background_gate") or 0
-    if row["blend_mode"] not in GATED_MODES or gate == 0:
-        return row["blend_mode"]
-    return f"{row['blend_mode']} {gate if isinstance(gate, str) else format(gate, 'g')}"
+    """Such as "smoe 0.05", "smoe learned" or "smoe paper"; rows that say no gate are of 0."""
+    mode, gate, faint = row["blend_mode"], row.get("background_gate") or 0, row.get("faint_below")
+    if is_paper(row):
+        return f"{mode} {PAPER}"
+    if mode not in GATED_MODES:
+        return mode
+    said = [mode, *([] if gate == 0 else [gate if isinstance(gate, str) else format(gate, "g")])]
+    return " ".join([*said, *([] if faint is None else ["all" if faint >= EVERYWHERE else f"below {faint:g}"])])
+
+
+def is_paper(row: Mapping[str, Any]) -> bool:
+    """Whether a row or a cell is of the program of the paper's authors."""
+    return all(row.get(name) == value for name, value in PAPER_PROGRAM.items())
 
 
 def net_of(kind: str) -> str:

@@ -62,7 +62,7 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
 def _stored(trained: Trained, folder: str) -> Trained:
     """The model of a checkpoint with a .ply in the folder."""
     renderer, ply = trained.renderer, os.path.join(folder, "model.ply")
-    save_model(ply, renderer.model, renderer.blend_mode, float(renderer.background_gate))
+    save_model(ply, renderer.model, renderer.blend_mode, float(renderer.background_gate), renderer.faint_below)
     return dataclasses.replace(trained, path=ply)
 
 

@@ -1,8 +1,8 @@
-"""GaussianModel to and from Inria-format .ply files, whose comments record blend mode and background gate."""
+"""GaussianModel to and from Inria-format .ply files, whose comments record how Gaussians are blended."""
 from __future__ import annotations
 
 import os
-from typing import Dict, NamedTuple, Optional, Tuple
+from typing import Dict, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
@@ -11,12 +11,14 @@ from diff_smoe_rasterization.settings import (
     BLEND_MODES,
     GATED_MODES,
     resolve_background_gate,
+    resolve_faint_below,
 )
 
 from ..errors import TrainerError
 from ..model import GaussianModel, finite_rows
 from ..system.files import new_file
 
+FAINT_BELOW = "faint_below"  # in comments
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, as viewers of 3DGS expect it
 
 
@@ -25,6 +27,7 @@ class Recorded(NamedTuple):
 
     blend_mode: Optional[str]
     background_gate: Optional[float]
+    faint_below: Optional[float] = None  # also: as usual
 
 
 def model_path(output: str, iteration: int) -> str:
@@ -32,13 +35,18 @@ def model_path(output: str, iteration: int) -> str:
     return os.path.join(output, FOLDER, f"iteration_{iteration}", "point_cloud.ply")
 
 
-def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:
-    """Writes the raw parameters, `comment blend_mode NAME` and in GATED_MODES `comment background_gate VALUE`."""
+def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float,
+               faint_below: Optional[float] = None) -> None:
+    """Writes the raw parameters, `comment blend_mode NAME` and in GATED_MODES `comment background_gate VALUE`.
+
+    And `comment faint_below VALUE`, if there is one.
+    """
     raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
     gaussians = io.Gaussians(
         means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
         log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode,
-        background_gate=background_gate if blend_mode in GATED_MODES else None)
+        background_gate=background_gate if blend_mode in GATED_MODES else None,
+        comments=() if faint_below is None else (f"{FAINT_BELOW} {faint_below:g}",))
     with new_file(path) as temporary:
         io.write_gaussians(temporary, gaussians)
 
@@ -61,7 +69,16 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
                            "infinite, so the rasterizer shows none; was the training diverging?")
     model = GaussianModel(raw, stored.sh_degree)
     model.active_sh_degree = stored.sh_degree
-    return model, Recorded(stored.blend_mode, stored.background_gate)
+    return model, Recorded(stored.blend_mode, stored.background_gate, _recorded_faint(path, stored.comments))
+
+
+def _recorded_faint(path: str, comments: Sequence[str]) -> Optional[float]:
+    said = [line.partition(" ")[2] for line in comments if line.startswith(FAINT_BELOW + " ")]
+    try:
+        return resolve_faint_below("smoe", float(said[-1])) if said else None
+    except ValueError as error:
+        raise TrainerError(f"{path}: its comment records {FAINT_BELOW} {said[-1]!r}; it must be a number of at least 0"
+                           ) from error
 
 
 def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:

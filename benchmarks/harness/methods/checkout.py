@@ -16,7 +16,12 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import numpy as np
 import torch
 
-from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, GATED_MODES
+from diff_smoe_rasterization.settings import (
+    BACKGROUND_GATE_VARIABLE,
+    BLEND_MODE_VARIABLE,
+    FAINT_BELOW_VARIABLE,
+    GATED_MODES,
+)
 
 from ...config import LEARNED, TrainConfig
 from ...patches.runtime import STAND_INS
@@ -143,7 +148,10 @@ class ThreeDGS:
         stand_ins = [str(STAND_INS)] * (self.method["variant"] != "unpatched")
         path = [item for item in [*self.method["pythonpath"], *ours, *stand_ins] if item]
         environment = {name: value for name, value in os.environ.items()
-                       if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, "PYTHONSAFEPATH")}
+                       if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, FAINT_BELOW_VARIABLE,
+                                       "PYTHONSAFEPATH")}
+        if self.config.faint_below is not None:
+            environment[FAINT_BELOW_VARIABLE] = str(self.config.faint_below)
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
 
 

@@ -90,6 +90,22 @@ def test_a_model_in_smoe_without_a_gate_has_0_and_says_so(tmp_path):
         assert runtime.blend_of(old) == {"blend_mode": "smoe", "background_gate": 0}
 
 
+def test_the_papers_program_is_a_word_for_three_settings(tmp_path, monkeypatch):
+    """A model's cfg_args records all three. Renderings of the process that name none have them."""
+    typed = run("paper")
+    assert runtime.blend_of(typed) == AUTHORS == {name: getattr(typed, name) for name in AUTHORS}
+    assert settings.resolve_faint_below("smoe", None) == 2
+    ours = model(tmp_path, "Namespace(blend_mode='smoe', background_gate=0.0, faint_below=2.0, eval=True)")
+    assert runtime.saved_blend_of(ours) == AUTHORS
+    runtime.blend_of(run("smoe", "0"))
+    assert settings.resolve_faint_below("smoe", None) == 0.25
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.9")
+    assert runtime.blend_of(run("smoe", "0"))["faint_below"] == settings.resolve_faint_below("smoe", None) == 0.9
+    assert runtime.blend_of(run("alpha")) == ALPHA
+    with pytest.raises(ValueError, match="gate is '0.5'; with the blend mode paper it is 0, or left out"):
+        runtime.blend_of(run("paper", "0.5"))
+
+
 AUTHORS = {"blend_mode": "smoe", "background_gate": 0, "faint_below": 2}  # as the paper's authors' program renders
 
 

@@ -86,6 +86,22 @@ def test_training_leaves_results_config_and_model(trained):
     assert int(re.search(r"element vertex (\d+)", header).group(1)) == row["num_gaussians"]
 
 
+def test_paper_is_the_program_of_the_authors(scene, tmp_path, capsys):
+    """smoe, gate 0, all pairs; the model's file and the row say so, and it is measured as it was trained."""
+    output, other = str(tmp_path / "paper"), str(tmp_path / "usual")
+    assert main(["train", scene, "-o", output, "--paper", *SHORT]) == 0
+    assert "blend mode smoe (gate 0, all pairs), strategy 3dgs" in capsys.readouterr().out
+    row, = results_of(output)
+    assert (row["blend_mode"], row["background_gate"], row["protocol"]["faint_below"]) == ("smoe", 0, 2)
+    assert load_model(ply_of(output), "cpu")[1] == ("smoe", 0, 2)
+    assert main(["eval", output]) == 0 and results_of(output)[0]["psnr_float"] == row["psnr_float"]
+    assert main(["train", scene, "-o", other, "--blend-mode", "smoe", "--background-gate", "0", *SHORT]) == 0
+    usual, = results_of(other)
+    assert usual["psnr_float"] != row["psnr_float"] and "faint_below" not in usual["protocol"]
+    assert "--blend-mode is 'alpha'; with --paper it is 'smoe', or left out" in fails(
+        capsys, "train", scene, "-o", other, "--paper", "--blend-mode", "alpha")
+
+
 def test_training_says_what_it_loaded_and_what_comes_next(scene, tmp_path, capsys):
     output = str(tmp_path / "out put")
     assert main(["train", scene, "-o", output, "--resolution", "2", "--init-points", "50", *SHORT]) == 0

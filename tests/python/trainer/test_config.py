@@ -78,6 +78,20 @@ def test_a_background_gate_that_the_mode_does_not_know_is_refused(mode, gate, wo
         TrainConfig(blend_mode=mode, background_gate=gate)
 
 
+def test_faint_below_is_of_the_gated_modes(monkeypatch):
+    assert parse("--blend-mode", "smoe").faint_below is None, "the mode's own"
+    assert parse("--blend-mode", "smoe_eq7", "--faint-below", "0.9").faint_below == 0.9
+    with pytest.raises(ConfigError, match="--faint-below is 0.9, but the blend mode is alpha; only smoe and smoe_eq7"):
+        parse("--faint-below", "0.9")
+    with pytest.raises(ConfigError, match="faint_below is -1.0; it must be a number, 0 or more"):
+        parse("--blend-mode", "smoe", "--faint-below", "-1")
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.5")
+    assert (parse("--blend-mode", "smoe").faint_below, parse().faint_below) == (0.5, None)
+    given = parse("--blend-mode", "smoe", "--faint-below", "2")
+    assert given.faint_below == given.changed(seed=1).faint_below == 2 and given.changed(
+        blend_mode="alpha").faint_below is None
+
+
 def test_another_mode_takes_its_own_background_gate():
     config = TrainConfig(blend_mode="smoe", background_gate=0.3)
     assert config.changed(seed=1).background_gate == 0.3
