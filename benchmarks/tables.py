@@ -265,7 +265,7 @@ def rules_table() -> str:
     lines = []
     for (scene, threshold), cells in grouped(rows, "scene", "densify_grad_threshold").items():
         by_rule = grouped(cells, "blend_mode", "background_gate")
-        line = [f"{shown(by_rule[rule], 'psnr', 2)} / {thousands(by_rule[rule])}" if rule in by_rule else "–"
+        line = [f"{shown(by_rule[rule], 'psnr', 2)}, {thousands(by_rule[rule])}" if rule in by_rule else "–"
                 for rule in columns.values()]
         lines.append((SCENES.index(scene), -threshold, [f"{scene} {threshold:g}", *line]))
     return table(["", *columns], (line for *_, line in sorted(lines)))

@@ -69,9 +69,9 @@ class Run:
         with damage_named(path):
             state = load_checkpoint(path, self.trainer.checkpoint_device)
             self.trainer.check_state(state)
-            self.trainer.load_state_dict(state)
-            self.history = list(state["history"])
-            self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
+        self.trainer.load_state_dict(state)
+        self.history = list(state["history"])
+        self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "

@@ -76,9 +76,7 @@ class BatchTrainer(Trainer):
             state[name] = _map_tensors(state[name], self.divided.whole)
         state["average"] = {name: self.divided.whole(tensor) if name in PARAMETERS else tensor
                             for name, tensor in state["average"].items()}
-        if state["random"]["cuda"]:
-            state["random"]["cuda"] = [torch.cuda.get_rng_state()]  # all processes draw the same numbers
-        return state
+        return state  # with the generators of one process, as all draw the same numbers
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         """Takes what `state_dict` gave, in whatever number of processes, on the host."""
@@ -87,10 +85,7 @@ class BatchTrainer(Trainer):
         own = {name: _map_tensors(state[name], self.divided.own_rows) for name in ("raw", "optimizer", "strategy")}
         own["average"] = {name: self.divided.own_rows(tensor) if name in PARAMETERS else tensor.to(self.config.device)
                           for name, tensor in state["average"].items()}
-        generators = state["random"]["cuda"]
-        super().load_state_dict({**state, **own, "random": {**state["random"], "cuda": []}})
-        if generators and torch.cuda.is_available():
-            torch.cuda.set_rng_state(generators[0].cpu())
+        super().load_state_dict({**state, **own})
 
 
 def new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None,

@@ -86,15 +86,16 @@ def damage_named(path: str) -> Iterator[None]:
     """Makes a TrainerError of whatever a damaged checkpoint causes while it is read and taken over.
 
     Its text is not torch's, which advises to read such a file with weights_only=False, and so to run code from it.
+    What says nothing of the file stays as it is: no memory, a GPU that fails, a module that this machine lacks.
     """
     try:
         yield
-    except TrainerError:
+    except (TrainerError, ImportError):
         raise
     except Exception as error:
         if isinstance(error, OSError) and error.strerror:
             raise TrainerError(f"{path}: cannot be read: {error.strerror}") from error
-        if out_of_memory(error):
+        if out_of_memory(error) or (isinstance(error, RuntimeError) and "CUDA" in str(error)):
             raise
         text = f"{path}: not a readable checkpoint; remove it, and --resume starts the run anew"
         if isinstance(error, Misfit):

@@ -211,7 +211,7 @@ class Trainer:
             "gate": self.gate.state_dict() if self.gate else None,
             "average": dict(self.optimizer.average),
             "order": self.order.state_dict(),
-            "random": random_state(),
+            "random": random_state(self.config.device),
         }
 
     def check_state(self, state: Dict[str, Any]) -> None:
@@ -236,4 +236,4 @@ class Trainer:
         if self.gate:
             self.gate.load_state_dict(state["gate"])
         self.order.load_state_dict(state["order"])
-        restore_random_state(state["random"])
+        restore_random_state(state["random"], self.config.device)

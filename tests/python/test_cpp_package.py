@@ -206,10 +206,13 @@ find_package(diff_smoe_rasterization REQUIRED COMPONENTS gpu)
 
 
 def documented_programs():
-    """The programs of docs/cpp.md, by the targets that the comment in their first line names, such as "core and io"."""
-    blocks = re.findall(r"```cpp\n(// dsmoe::(\w+(?: and dsmoe::\w+)*)[^\n]*\n.*?)```",
-                        (ROOT / "docs" / "cpp.md").read_text(), re.DOTALL)
-    return {name.replace("dsmoe::", ""): text for text, name in blocks}
+    """The programs of docs/cpp.md and examples/cpp, by the targets that the comment in their first line names."""
+    page = (ROOT / "docs" / "cpp.md").read_text(encoding="utf-8")
+    programs = re.findall(r"```cpp\n(.*?)```", page, re.DOTALL)
+    for path in sorted((ROOT / "examples" / "cpp").glob("*.cpp")):
+        assert f"(../examples/cpp/{path.name})" in page
+        programs.append(path.read_text(encoding="utf-8"))
+    return {re.match(r"// (dsmoe::\w+(?: and dsmoe::\w+)*)", text)[1].replace("dsmoe::", ""): text for text in programs}
 
 
 def test_every_target_is_documented_by_a_program():

@@ -15,7 +15,7 @@ def test_the_examples_run():
     text = README.read_text(encoding="utf-8")
     preamble, *flavours = re.split(r"^## ([\w, ]+)$", text, flags=re.MULTILINE)
     names, sections = flavours[::2], flavours[1::2]
-    assert names == ["inria", "inria_2024", "More than images", "gsplat", "Which projects"]
+    assert names == ["inria", "More than images", "gsplat", "Which projects"]
     torch.manual_seed(0)
     variables = {}
     example = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -35,8 +35,6 @@ def test_the_examples_run():
             assert (variables["radii"] > 0).any()
         if name == "inria":
             variables["from_inria"] = variables["color"]
-        if name == "inria_2024":
-            assert (variables["dc"] != variables["shs"][:, :1]).any() and variables["inverse_depth"].max() > 0.1
 
 
 def test_the_table_is_that_of_the_contracts():

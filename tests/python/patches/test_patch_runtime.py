@@ -102,7 +102,7 @@ def test_the_papers_program_is_a_word_for_three_settings(tmp_path, monkeypatch):
     monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.9")
     assert runtime.blend_of(run("smoe", "0"))["faint_below"] == settings.resolve_faint_below("smoe", None) == 0.9
     assert runtime.blend_of(run("alpha")) == ALPHA
-    with pytest.raises(ValueError, match="the background gate is '0.5'; with the blend mode paper it is 0, or left out"):
+    with pytest.raises(ValueError, match="gate is '0.5'; with the blend mode paper it is 0, or left out"):
         runtime.blend_of(run("paper", "0.5"))
 
 
