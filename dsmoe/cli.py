@@ -14,6 +14,7 @@ from .config_arguments import config_from_arguments, given_options, take_paper
 from .early import check_early
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .patches import PatchError
+from .presets import STRATEGY
 from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
 from .system.process import command
@@ -59,21 +60,25 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
-        hint = f"; continue it with: {_resume_command(arguments.output)}" if continues else ""
+        trains = arguments.command in ("train", "simplify")
+        continues = trains and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
+        hint = f"; continue it with: {_resume_command(arguments)}" if continues else ""
         if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return exit_status(stop)
 
 
-def _resume_command(output: str) -> str:
+def _resume_command(arguments: argparse.Namespace) -> str:
     """What to type to continue an interrupted training."""
-    words = [command(), "train", "--resume", "-o", shlex.quote(output)]
+    if arguments.command == "simplify":
+        given = [word for word in arguments.command_words if word not in ("--resume", "--overwrite")]
+        return " ".join([command(), *map(shlex.quote, given), "--resume"])
+    words = [command(), "train", "--resume", "-o", shlex.quote(arguments.output)]
     size = os.environ.get("WORLD_SIZE", "1")
     if size == "1":
         return " ".join(words)
-    if os.environ.get("LOCAL_WORLD_SIZE") == size and TrainConfig.load(output).device == "cuda":
+    if os.environ.get("LOCAL_WORLD_SIZE") == size and TrainConfig.load(arguments.output).device == "cuda":
         return " ".join([*words, "--gpus", size])
     return " ".join([*words, "(by torchrun, as before)"])
 
@@ -203,17 +208,46 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
+    if config.strategy == STRATEGY and not arguments.resume and "budget" not in given_options(arguments):
+        print("note: that number is chosen for the scene; --budget N makes more or fewer, and --strategy 3dgs is the "
+              "recipe of 3DGS")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
                 say=lambda text: print(text, flush=True))
     print(results_table([row]))
+    if row["psnr_train"] is not None:
+        print(f"the training views have {row['psnr_train']:.2f} dB")
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
     if viewer_warning(row):
         print(viewer_warning(row))
     print(f"model: {printable(model_path(config.output, config.iterations))}")
     print(f"to look at it in a browser: {command()} export {shlex.quote(config.output)} -o model.html")
+
+
+def _simplify(arguments: argparse.Namespace) -> None:
+    from .results.modelfile import model_path
+    from .results.rows import results_table, viewer_warning
+    from .simplify import simplify
+    from .system.process import set_up_process
+
+    arguments.device = getattr(arguments, "device", "auto")
+    _choose_device(arguments)
+    set_up_process(arguments.device)
+    given = {name: value for name, value in given_options(arguments).items()
+             if name not in ("scene", "output", "budget")}
+    row = simplify(arguments.model, arguments.output, scene=arguments.scene, budget=arguments.budget,
+                   keep=arguments.keep, loses=arguments.loses, resume=arguments.resume, overwrite=arguments.overwrite,
+                   progress=not arguments.quiet, say=lambda text: print(text, flush=True), **given)
+    print(results_table([row["start"], row]))
+    if row["protocol"]["scene_kind"] == "model":
+        print("measured against renderings of the model: there are no photographs")
+    if viewer_warning(row):
+        print(viewer_warning(row))
+    path = model_path(arguments.output, row["protocol"]["iterations"])
+    print(f"model: {printable(path)}, {os.path.getsize(path) / 1e6:.1f} MB of {row['start']['bytes'] / 1e6:.1f} MB")
+    print(f"for the web: {command()} export {shlex.quote(arguments.output)} -o model.spz")
 
 
 def _train_config(arguments: argparse.Namespace) -> TrainConfig:
@@ -225,7 +259,8 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
         del arguments.scene
     if not given.get("output") or not given.get("scene") and not arguments.resume:
         arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs only OUT")
-    presets = ["--fast"] * arguments.fast + ["--scale-recipe"] * arguments.scale_recipe
+    presets = [f"--{name}" for name in ("fast", "best") if getattr(arguments, name)]
+    presets += ["--scale-recipe"] * arguments.scale_recipe
     if arguments.resume and presets and "scene" not in given:
         arguments.command_parser.error(f"{presets[0]} needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")
@@ -234,9 +269,20 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
 
         earlier = TrainConfig.load(run).device if arguments.resume and holds_run(run) else None
         given["device"] = arguments.device = earlier or chosen_device()
+    if given.get("init"):
+        _start_from(arguments)
     if not arguments.resume or "scene" in given and (presets or not holds_run(run)):
         return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
+
+
+def _start_from(arguments: argparse.Namespace) -> None:
+    """--init becomes the model's file, and the blend is its own unless another one is asked for."""
+    from .starting import blend_options, find_model, read_start
+
+    arguments.init = find_model(arguments.init).path
+    for name, value in blend_options(read_start(arguments.init), given_options(arguments)).items():
+        setattr(arguments, name, value)
 
 
 def _scene(arguments: argparse.Namespace) -> None:
@@ -362,5 +408,6 @@ def _completion(arguments: argparse.Namespace) -> None:
     print(completion_script(arguments.shell))
 
 
-COMMANDS = {"train": _train, "scene": _scene, "eval": _eval, "render": _render, "export": _export, "view": _view,
-            "patch": _patch, "run": _run, "bench": _bench, "info": _info, "completion": _completion}
+COMMANDS = {"train": _train, "simplify": _simplify, "scene": _scene, "eval": _eval, "render": _render,
+            "export": _export, "view": _view, "patch": _patch, "run": _run, "bench": _bench, "info": _info,
+            "completion": _completion}

@@ -12,7 +12,7 @@ from PIL import Image
 
 from .config import CHECKPOINT_NAME, LEARNED, TrainConfig
 from .errors import TrainerError, printable
-from .results.evaluation import Measure, evaluate
+from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, model_path
 from .results.pictures import file_names
@@ -64,7 +64,9 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     evaluation = evaluate(renderer, views, device, progress, measure)
     if opened.so_far:
         config, seconds = replace(config, iterations=opened.so_far.iteration), opened.so_far.seconds
-    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
+    training = evaluate(renderer, scene.train, device, progress, psnr_alone, passes=1).metrics["psnr"]
+    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, training,
+                     renderer.background_gate)
     if split == "test" and not is_other and not opened.so_far:
         try:
             write_results(output, [row])

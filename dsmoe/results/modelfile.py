@@ -57,23 +57,27 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
 
     Raises TrainerError naming file and reason, also if no Gaussian can be shown.
     """
+    stored = read_ply(path)
+    raw = raw_of(stored, device)
+    if len(stored.means3D) and not finite_rows(raw).any():
+        raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
+                           "infinite, so the rasterizer shows none; was the training diverging?")
+    model = GaussianModel.from_gaussians(raw, stored.sh_degree)
+    return model, Recorded(stored.blend_mode, stored.background_gate, recorded_faint(path, stored.comments))
+
+
+def read_ply(path: str) -> io.Gaussians:
+    """Reads a .ply. Raises TrainerError naming file and reason."""
     try:
-        stored = io.read_gaussians(path)
+        return io.read_gaussians(path)
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
         other = "; it is no model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
         raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
-    raw = raw_of(stored, device)
-    if len(stored.means3D) and not finite_rows(raw).any():
-        raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
-                           "infinite, so the rasterizer shows none; was the training diverging?")
-    model = GaussianModel(raw, stored.sh_degree)
-    model.active_sh_degree = stored.sh_degree
-    return model, Recorded(stored.blend_mode, stored.background_gate, _recorded_faint(path, stored.comments))
 
 
-def _recorded_faint(path: str, comments: Sequence[str]) -> Optional[float]:
+def recorded_faint(path: str, comments: Sequence[str]) -> Optional[float]:
     said = [line.partition(" ")[2] for line in comments if line.startswith(FAINT_BELOW + " ")]
     try:
         return resolve_faint_below("smoe", float(said[-1])) if said else None

@@ -9,6 +9,7 @@ import re
 import stat
 import struct
 import threading
+import warnings
 
 import numpy as np
 import pytest
@@ -131,6 +132,71 @@ def test_of_several_optimizers_that_of_the_centres_counts(computed):
 
 
 @pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+@pytest.mark.parametrize("others", [1, 2, 3])
+@pytest.mark.parametrize("set_to_none", [True, False])
+def test_centres_that_no_optimizer_holds_wait_for_none(others, set_to_none):
+    """They are a frozen Parameter, and their gradient is never dropped: the gate steps once in each iteration."""
+    view, gaussians = scene()
+    names = ["opacities", "scales", "rotations"][:others]
+    optimizers = [torch.optim.Adam([gaussians[name]], lr=0) for name in names]
+    expected = []
+    for _ in range(4):
+        expected.append(gradient_at(gate.value(), view, gaussians))
+        loss(view, gaussians).backward()
+        for optimizer in optimizers:
+            optimizer.step()
+            assert gate.value() == pytest.approx(by_hand(expected), rel=1e-4), "with the first one"
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=set_to_none)
+    # Once an optimizer takes them, the gate steps with that one.
+    own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+    loss(view, gaussians).backward()
+    own.step()
+    before = gate.value()
+    loss(view, gaussians).backward()
+    optimizers[0].step()
+    assert gate.value() == before
+    own.step()
+    assert gate.value() != before
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+def test_an_optimizer_that_holds_the_centres_and_has_not_stepped_yet_is_waited_for():
+    """From the first iteration on, whichever steps first."""
+    view, gaussians = scene()
+    own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+    others = [torch.optim.Adam([gaussians[name]], lr=0) for name in ("opacities", "scales")]
+    for _ in range(2):  # the second time nothing was dropped: both passes add up
+        loss(view, gaussians).backward()
+        for optimizer in others * 2:
+            optimizer.step()
+        assert gate.value() == pytest.approx(START, rel=1e-6)
+    own.step()
+    assert gate.value() != pytest.approx(START, rel=1e-6)
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+@pytest.mark.parametrize("known", [True, False])
+def test_an_optimizer_that_densification_makes_anew_costs_no_step(known):
+    """With new centres, between the backward pass and the step; another optimizer steps beside it."""
+    view, gaussians = scene()
+    other = torch.optim.Adam([gaussians["opacities"]], lr=0)
+    own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+    steps = 0
+    for iteration in range(4):
+        before = gate.value()
+        loss(view, gaussians).backward()
+        if iteration % 2 == known:
+            gaussians["means3D"] = torch.nn.Parameter(gaussians["means3D"].detach().clone())
+            own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+        for optimizer in (other, own):
+            optimizer.step()
+            optimizer.zero_grad()
+        steps += gate.value() != before
+    assert steps == 4 and gate.state_dict()["adam"]["step"] == 4
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
 def test_densification_between_the_backward_pass_and_the_step_loses_no_step():
     """3DGS puts new centres into its optimizer there; before the first step nothing tells whose they are."""
     view, gaussians = scene()
@@ -240,6 +306,27 @@ def test_a_step_before_the_backward_pass_of_another_rendering_is_no_error():
     optimizer.step()
     assert gate.value() != before
     waiting.backward()
+
+
+def test_processes_that_each_learn_a_gate_are_told_so(tmp_path):
+    """Once, and only where there are several."""
+    view, gaussians = scene()
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/meeting", rank=0, world_size=1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss(view, gaussians)
+    finally:
+        torch.distributed.destroy_process_group()
+    gate.reset()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.distributed, "is_initialized", lambda: True)
+        patch.setattr(torch.distributed, "get_world_size", lambda: 4)
+        with pytest.warns(UserWarning, match="each of the 4 processes of this training learns a background gate of"):
+            loss(view, gaussians)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss(view, gaussians)
 
 
 def test_without_gradients_of_gaussians_an_image_has_none():

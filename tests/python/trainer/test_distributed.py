@@ -49,7 +49,7 @@ def words_of(config):
     """The options of a training on the command line."""
     names = ("batch", "budget", "strategy", "strategy_options", "iterations", "blend_mode", "sh_degree_interval",
              "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
-             "densify_grad_threshold", "checkpoint_every")
+             "densify_grad_threshold", "position_lr_max_steps", "checkpoint_every")
     return [config.scene, "-o", config.output, "--quiet",
             *(f"--{name.replace('_', '-')}={getattr(config, name)}" for name in names)]
 
