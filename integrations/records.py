@@ -35,7 +35,7 @@ PART = ".dsmoe_part-"  # begins the name of a folder with a file that is not who
 DAMAGE = (ValueError, OverflowError, RecursionError, OSError)
 _kept = False
 _told: Set[str] = set()
-_models_read: Dict[str, "Record"] = {}  # by the file's name, the latest one last
+_models_read: Dict[str, Record] = {}  # by the file's name, the latest one last
 
 
 class Record(NamedTuple):
