@@ -3,9 +3,9 @@
 
 #include <algorithm>
 
-#include "../refuse_training.h"
+#include "cpu/parallel.h"
 #include "dsmoe/training/gaussians.h"
-#include "parallel.h"
+#include "refuse_training.h"
 
 namespace dsmoe {
 namespace cpu {

@@ -3,8 +3,8 @@
 
 #include <algorithm>
 
-#include "../refuse_training.h"
-#include "parallel.h"
+#include "cpu/parallel.h"
+#include "refuse_training.h"
 
 namespace dsmoe {
 namespace cpu {

@@ -2,9 +2,9 @@
 // them.
 #include <algorithm>
 
-#include "../refuse_training.h"
+#include "cuda/tuning.cuh"
 #include "dsmoe/training/adam.h"
-#include "tuning.cuh"
+#include "refuse_training.h"
 
 namespace dsmoe {
 namespace cuda {

@@ -5,8 +5,8 @@
 #include <algorithm>
 #include <vector>
 
-#include "../refuse_training.h"
-#include "parallel.h"
+#include "cpu/parallel.h"
+#include "refuse_training.h"
 
 namespace dsmoe {
 namespace cpu {
