@@ -4,7 +4,6 @@
 
 #include "cuda/tuning.cuh"
 #include "dsmoe/training/adam.h"
-#include "refuse_training.h"
 
 namespace dsmoe {
 namespace cuda {

@@ -1,7 +1,6 @@
 // Rows by a list, of several tensors in one launch: a block writes a piece of one of them.
 #include "cuda/tuning.cuh"
 #include "dsmoe/training/gather.h"
-#include "refuse_training.h"
 
 namespace dsmoe {
 namespace cuda {

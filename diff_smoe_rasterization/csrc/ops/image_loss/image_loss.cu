@@ -2,7 +2,6 @@
 // one adds up. A block computes one tile of one plane. Windows run along rows, then along columns, in shared memory.
 #include "cuda/tuning.cuh"
 #include "dsmoe/training/image_loss.h"
-#include "refuse_training.h"
 
 namespace dsmoe {
 namespace cuda {
