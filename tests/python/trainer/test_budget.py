@@ -546,8 +546,8 @@ def test_settings_of_gate_are_checked(text, words):
 
 
 def test_settings_of_gate_are_of_gate_only():
-    text = ("overshoot=0,removals=1,views=1000000,moves=0,move_views=1,pace=1,worth=0,bands=1,needs=0,near=0,anneal=0.5,"
-            "squares=0,average=0")
+    text = ("overshoot=0,removals=1,views=1000000,moves=0,move_views=1,pace=1,worth=0,bands=1,needs=0,near=0,"
+            "anneal=0.5,squares=0,average=0")
     assert TrainConfig(budget=60, strategy_options=text.replace(",", ", ")).validate()
     assert importance_settings(parse_importance_options(text)) == text
     with pytest.raises(ConfigError, match="--strategy-options is 'views=3'; it must be left out with --strategy mcmc"):
