@@ -102,6 +102,10 @@ class TrainConfig:
     init_points: int = _option(
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
+    init: str = _option(
+        "", "start from the Gaussians of a model, in place of the scene's points: a .ply, .splat, .spz or .glb, an "
+            "output folder of `dsmoe train` or a model folder of 3DGS. --blend-mode is then the model's by default",
+        metavar="MODEL")
     budget: int = _option(
         0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed (default: importance chooses it "
            "for the scene)")
@@ -179,6 +183,7 @@ class TrainConfig:
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
+        self._require("init_points", self.init_points == 0 or not self.init, "left out with --init")
         self._require("budget", self.budget >= 0, "at least 0")
         if self.strategy in ("importance", "mcmc"):
             if self.budget == 0:
@@ -288,9 +293,9 @@ class TrainConfig:
                                             if getattr(self, name) == getattr(default, name)})
 
     def save(self, folder: str) -> None:
-        """Writes OUT/config.json, with the scene's absolute path."""
-        scene = os.path.abspath(self.scene) if self.scene else ""
-        text = json.dumps({**self.record(), "scene": scene}, indent=2) + "\n"
+        """Writes OUT/config.json, with absolute paths of the scene and of the model to start from."""
+        paths = {name: os.path.abspath(path) for name, path in (("scene", self.scene), ("init", self.init)) if path}
+        text = json.dumps({**self.record(), **paths}, indent=2) + "\n"
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
 
     def record(self) -> Dict[str, Any]:
@@ -358,7 +363,7 @@ class TrainConfig:
     def differences(self, later: TrainConfig) -> List[str]:
         """Options that keep `later` from continuing this run, one text each; more iterations do not."""
         # These alter when something is written or where, never the trained Gaussians.
-        harmless = {"scene", "output", "strict", "eval_every", "checkpoint_every"}
+        harmless = {"scene", "init", "output", "strict", "eval_every", "checkpoint_every"}
         if later.iterations > self.iterations:
             harmless.add("iterations")
         if self.blend_mode != later.blend_mode:  # what follows from that needs no text of its own

@@ -16,7 +16,7 @@ GROUPS = {
     "scene": ("images", "strict", "resolution", "test_every", "principal_point", "init_points", "white_background",
               "random_background"),
     "blending": ("blend_mode", "background_gate", "background_gate_bound", "faint_below", "antialiasing"),
-    "length, and number of Gaussians": ("iterations", "batch", "budget", "strategy", "strategy_options"),
+    "length, and number of Gaussians": ("iterations", "batch", "init", "budget", "strategy", "strategy_options"),
     "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
     "recipe": (),
 }

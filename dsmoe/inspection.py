@@ -49,8 +49,8 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     layout = read_layout(config)
     scene = load_scene(config, progress, layout).to(device)
-    note, is_other = _compared(scene, config)
-    for line in filter(None, (layout.warning, note)):
+    note, is_other = compared(scene, config)
+    for line in filter(None, (layout.warning, note + f"; {RESULTS_NAME} stays" * is_other)):
         print(line)
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
@@ -122,8 +122,11 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     return OpenedRun(renderer, so_far.path, so_far)
 
 
-def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
-    """What to say of a scene that the run's checkpoint does not record, and whether it is another one; else nothing."""
+def compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
+    """What to say of a scene that the run's checkpoint does not record, and whether it is another one; else nothing.
+
+    scene: loaded with checksums.
+    """
     path = os.path.join(config.output, CHECKPOINT_NAME)
     try:
         with damage_named(path):
@@ -133,8 +136,7 @@ def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
     difference = difference_of(scene, recorded)
     if not difference:
         return "", False
-    return (f"note: {config.scene} is not the scene that {config.output} was trained on: {difference} here; "
-            f"{RESULTS_NAME} stays"), True
+    return f"note: {config.scene} is not the scene that {config.output} was trained on: {difference} here", True
 
 
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",

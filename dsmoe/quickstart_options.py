@@ -15,7 +15,7 @@ MODES = ("alpha", "smoe")
 DEFAULT_FOLDER = "quickstart_output"  # has a folder for each scene
 # Offered by `dsmoe train` and fixed here.
 FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "background_gate_start",
-         "background_gate_lr", "eval_every", "checkpoint_every")
+         "background_gate_lr", "init", "eval_every", "checkpoint_every")
 
 
 def parse(argv: Optional[List[str]] = None) -> argparse.Namespace:

@@ -46,6 +46,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["deterministic"] = True
     if config.budget:
         unusual["budget"] = config.budget
+    if config.init:
+        unusual["init"] = os.path.basename(config.init)
     if config.strategy == "importance":  # with the defaults of this version
         unusual.update(strategy_options=importance_settings(config.importance_options()),
                        densify_until_iter=config.densify_until_iter)

@@ -20,8 +20,9 @@ class Forecast:
     def __init__(self, config: TrainConfig, scene: Scene) -> None:
         self.config = config
         camera = scene.train[0].camera
+        self.removes = scene.start is not None and 0 < config.budget < len(scene.points.positions)
         smaller = smaller_images(camera.width, camera.height)
-        is_short = config.iterations <= FAST["cpu"].iterations and not smaller
+        is_short = self.removes or config.iterations <= FAST["cpu"].iterations and not smaller
         self.shorter = "" if is_short else f"{FLAG} {flags_text(smaller)}".rstrip()
         self.begun: Optional[float] = None
         self.first = 0
@@ -44,8 +45,8 @@ class Forecast:
 
     def text(self, left: int, seconds: float) -> str:
         """left: iterations."""
-        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, longer as Gaussians are "
-                "added")
+        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, "
+                + ("less as Gaussians are removed" if self.removes else "longer as Gaussians are added"))
         if seconds < LONG_SECONDS or not self.shorter:
             return line
         return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: --overwrite {self.shorter}"

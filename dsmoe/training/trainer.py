@@ -13,6 +13,7 @@ from ..model import GaussianModel
 from ..optimizer import GaussianOptimizer
 from ..results.evaluation import PASSES, Evaluation, Measure, evaluate, psnr_alone
 from ..results.metrics import image_metrics, psnr
+from ..results.modelfile import raw_of
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..scenes.images import View
 from ..scenes.scene import Scene, difference_of, scene_fingerprint
@@ -29,6 +30,13 @@ from .strategies import STRATEGIES
 from .strategy import Step, StrategyContext, ViewStep, is_due
 
 
+def first_model(config: TrainConfig, scene: Scene) -> GaussianModel:
+    """The Gaussians that a training begins with: round ones at the scene's points, or those of a model."""
+    if scene.start is None:
+        return GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+    return GaussianModel.from_gaussians(raw_of(scene.start.gaussians, config.device), config.sh_degree)
+
+
 class Trainer:
     """A training run over a loaded scene; `step` is one iteration of 3DGS, or several over a batch of views."""
 
@@ -39,7 +47,7 @@ class Trainer:
         seed_everything(config.seed)
         self.config = config
         self.scene = scene.to(config.device)
-        self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+        self.model = first_model(config, scene)
         self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
         self.shards = self._make_shards()
         background = background_color(config.white_background, config.device)
