@@ -95,7 +95,7 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
 
 
 def _check_folder(photos: str) -> None:
-    """Raises SceneError if it is no folder."""
+    """Raises SceneError if it is not a folder."""
     if is_folder(photos):
         return
     if not is_file(photos):

@@ -48,7 +48,7 @@ class BatchTrainer(Trainer):
         return self.batches.asked
 
     def evaluate(self, progress: bool = False) -> Evaluation:
-        """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
+        """Renders the test views, each in one process; a view's time is the total divided by the number of views."""
         group, device, views, shown = self.group, self.config.device, self.scene.test, self.result()
 
         def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:
