@@ -7,6 +7,7 @@ from .autograd import INPUTS, OPTIONS
 from .checks import check_tensor
 from .extension import BACKENDS, build_info
 from .learned_gate import gate_of
+from .raw_values import look_for_raw_values
 from .settings import BLEND_MODES, FEATURE_OUTPUTS, OUTPUTS, Rendering, resolve_blend, resolve_faint_below
 
 
@@ -22,6 +23,7 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
     for name, tensor in tensors.items():
         if tensor is not None:
             inputs[name] = optional(name, tensor)
+    look_for_raw_values(function, inputs, settings.debug)
     background_gate = gate_of(background_gate, blend_mode, inputs.values(), means3D)
     fixed_gate = background_gate
     if isinstance(background_gate, torch.Tensor):
@@ -41,7 +43,7 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
         options = [kind(value) for value, (_, kind) in zip(given, _SETTING_OPTIONS)]
     except (TypeError, ValueError, OverflowError, RuntimeError):
         options = None
-    # Unchanged by conversion: so it was no string (float() and bool() take those) and lost no digits.
+    # Unchanged by conversion: so it was not a string (float() and bool() take those) and lost no digits.
     if options != given or not all([-_WHOLE_LIMIT < options[place] < _WHOLE_LIMIT for place in _WHOLE_OPTIONS]):
         for (name, kind), value in zip(_SETTING_OPTIONS, given):
             if not _fits(kind, value):

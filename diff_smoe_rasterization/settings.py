@@ -83,7 +83,7 @@ class GaussianRasterizationSettings(NamedTuple):
     sh_degree: int  # active degree, 0 to 3; shs may hold more
     campos: torch.Tensor  # [3] camera centre, world
     prefiltered: bool = False  # the caller asserts that every point lies in front of the near plane
-    debug: bool = False  # check images and gradients for NaN; slower. Attributes: `strict`
+    debug: bool = False  # look for NaN in images and gradients, and for raw values; slower. Attributes: `strict`
     antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
     near: float = 0.2  # Gaussians with view depth <= near are culled
     # SMoE modes: also skip alpha below this; 0 is the paper's rule. `smoe`: pairs below this are not strong ones

@@ -23,8 +23,8 @@ NATIVE = "native"
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
 VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
 # Of each public trainer, whether it can be patched to this package's rasterizer (patches).
-CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
-             "2dgs": False, "dbs": False}
+CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "compact-3dgs": True, "hac": True,
+             "hac-plus": True, "2dgs": False, "dbs": False}
 WITHOUT_STRATEGY = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
 COUNTED_BY = {"taming": "--budget", "dbs": "--cap_max"}  # they are given a number of primitives, and have no threshold
 NEEDS = {"dbs": "--cap_max"}  # an argument without which a method has no size
@@ -33,7 +33,7 @@ OF_NATIVE_ALONE = ("strategy_options",)
 OF_3DGS_ALONE = ("antialiasing", "feature_lr", "percent_dense", "opacity_reset_interval")
 LACKS = {"3dgs-2023": ("antialiasing",), "3dgs-2024": (), "c3dgs": ("antialiasing",), "2dgs": ("antialiasing",),
          "taming": ("antialiasing", "feature_lr"),  # it has a second rate for the higher SH bands
-         "dbs": OF_3DGS_ALONE,
+         "dbs": OF_3DGS_ALONE, "compact-3dgs": ("antialiasing", "sh_degree"),  # its colours are of degree 0
          **dict.fromkeys(("hac", "hac-plus"), (*OF_3DGS_ALONE, "sh_degree", "sh_degree_interval", "opacity_lr",
                                                "rotation_lr", "densify_from_iter", "densify_until_iter",
                                                "densification_interval"))}

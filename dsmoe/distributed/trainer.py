@@ -8,7 +8,7 @@ import torch
 from ..config import TrainConfig
 from ..errors import TrainerError
 from ..model import PARAMETERS, GaussianModel
-from ..results.evaluation import Evaluation, rows_of_views, summary
+from ..results.evaluation import Evaluation, Measure, rows_of_views, summary
 from ..results.rendering import Rasterize
 from ..scenes.images import View
 from ..scenes.scene import Scene
@@ -47,9 +47,9 @@ class BatchTrainer(Trainer):
         """Whether a process was asked to stop before the latest step, which all learn in that step."""
         return self.batches.asked
 
-    def evaluate(self, progress: bool = False) -> Evaluation:
-        """Renders the test views, each in one process; a view's time is the total divided by the number of views."""
-        group, device, views, shown = self.group, self.config.device, self.scene.test, self.result()
+    def _evaluate(self, views: Sequence[View], progress: bool, measure: Measure, passes: int) -> Evaluation:
+        """Each view in one process; a view's time is the total divided by the number of views."""
+        group, device, shown = self.group, self.config.device, self.result()
 
         def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:
             settings = [shown.settings_of(view.camera) for view in some]
@@ -60,7 +60,7 @@ class BatchTrainer(Trainer):
             return max(group.gather_numbers([round(1000 * seconds)], device))[0] / 1000
 
         batches = [views[begin:begin + group.size] for begin in range(0, len(views), group.size)]
-        by_process = group.gather_objects(rows_of_views(render, batches, device, progress, agreed=longest))
+        by_process = group.gather_objects(rows_of_views(render, batches, device, progress, measure, passes, longest))
         return summary([by_process[index % group.size][index // group.size]  # type: ignore[index]
                         for index in range(len(views))])
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Dict, NamedTuple, Optional, Sequence, Tuple
 
 import torch
@@ -14,7 +15,7 @@ from diff_smoe_rasterization.settings import (
     resolve_faint_below,
 )
 
-from ..errors import TrainerError
+from ..errors import TrainerError, printable
 from ..model import GaussianModel, finite_rows
 from ..system.files import new_file
 
@@ -56,23 +57,27 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
 
     Raises TrainerError naming file and reason, also if no Gaussian can be shown.
     """
+    stored = read_ply(path)
+    raw = raw_of(stored, device)
+    if len(stored.means3D) and not finite_rows(raw).any():
+        raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
+                           "infinite, so the rasterizer shows none; was the training diverging?")
+    model = GaussianModel.from_gaussians(raw, stored.sh_degree)
+    return model, Recorded(stored.blend_mode, stored.background_gate, recorded_faint(path, stored.comments))
+
+
+def read_ply(path: str) -> io.Gaussians:
+    """Reads a .ply. Raises TrainerError naming file and reason."""
     try:
-        stored = io.read_gaussians(path)
+        return io.read_gaussians(path)
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
         other = "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
         raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
-    raw = raw_of(stored, device)
-    if len(stored.means3D) and not finite_rows(raw).any():
-        raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
-                           "infinite, so the rasterizer shows none; was the training diverging?")
-    model = GaussianModel(raw, stored.sh_degree)
-    model.active_sh_degree = stored.sh_degree
-    return model, Recorded(stored.blend_mode, stored.background_gate, _recorded_faint(path, stored.comments))
 
 
-def _recorded_faint(path: str, comments: Sequence[str]) -> Optional[float]:
+def recorded_faint(path: str, comments: Sequence[str]) -> Optional[float]:
     said = [line.partition(" ")[2] for line in comments if line.startswith(FAINT_BELOW + " ")]
     try:
         return resolve_faint_below("smoe", float(said[-1])) if said else None
@@ -89,16 +94,17 @@ def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tens
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
-    """The blend mode to render a .ply with: the recorded one, or the one asked for if none is recorded.
+    """The blend mode to render a .ply with: the recorded one, else the one asked for, else alpha, which a line says.
 
-    Raises TrainerError if neither is known, if they disagree, or if the recorded one is unknown.
+    Raises TrainerError if both disagree, or the recorded one is unknown.
     """
     if recorded is not None and recorded not in BLEND_MODES:
         raise TrainerError(f"{path}: its comment records the blend mode {recorded!r}; this version knows "
                            f"{', '.join(BLEND_MODES)}")
     if recorded is None and asked is None:
-        raise TrainerError(f"{path} does not say which blend mode it was trained with (no `comment blend_mode`); "
-                           "pass --blend-mode, which is alpha for files of other 3DGS programs")
+        print(f"note: {printable(path)} records no blend mode, so it is alpha, as other 3DGS programs blend; "
+              "--blend-mode says otherwise", file=sys.stderr)
+        return "alpha"
     if recorded is not None and asked is not None and asked != recorded:
         raise TrainerError(f"{path} was trained with the blend mode {recorded}, not {asked}; "
                            "in another mode its Gaussians show another scene")

@@ -21,10 +21,12 @@ RESULTS_NAME = "results.json"
 
 
 def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seconds: Optional[float],
-               evaluation: Evaluation, background_gate: Optional[float] = None) -> Dict[str, Any]:
+               evaluation: Evaluation, psnr_train: Optional[float] = None, background_gate: Optional[float] = None
+               ) -> Dict[str, Any]:
     """One row: the figures first, then the protocol that makes them comparable.
 
-    background_gate: the one that was rendered with; None: the config's.
+    psnr_train: over the training views, if it was measured. background_gate: the one that was rendered with; None: the
+    config's.
     """
     views = list(scene.test) or list(scene.train)
     first = views[0].camera
@@ -44,6 +46,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["deterministic"] = True
     if config.budget:
         unusual["budget"] = config.budget
+    if config.init:
+        unusual["init"] = os.path.basename(config.init)
     if config.strategy == "importance":  # with the defaults of this version
         unusual.update(strategy_options=importance_settings(config.importance_options()),
                        densify_until_iter=config.densify_until_iter)
@@ -62,6 +66,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         "blend_mode": config.blend_mode,
         "background_gate": config.background_gate if background_gate is None else background_gate,
         **evaluation.metrics,
+        "psnr_train": psnr_train,
         "num_gaussians": num_gaussians,
         "train_seconds": train_seconds,  # only the loop: without loading, evaluation and checkpoints
         "fps": evaluation.fps,

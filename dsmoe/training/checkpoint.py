@@ -19,7 +19,7 @@ from .state_check import Misfit, check_model, check_numbers
 TENSOR = "__tensor__"  # stands for a tensor
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
-FORMAT = 6  # raised when the content changes so that older files cannot be resumed
+FORMAT = 7  # raised when the content changes so that older files cannot be resumed
 
 
 class SoFar(NamedTuple):

@@ -194,6 +194,16 @@ class C3DGS(ThreeDGS):
         return sum(size_of(os.path.join(folder, name, self.container)) for name in os.listdir(folder))
 
 
+class Compact3DGS(ThreeDGS):
+    """Compact-3DGS (Lee et al. 2024): the model is quantised, and its colours are those of a hash grid."""
+
+    container = "point_cloud_pp.npz"
+    of_gaussians = False
+
+    def train_arguments(self) -> List[str]:
+        return [*super().train_arguments(), "--comp", "--store_npz"]
+
+
 class InOneProcess(ThreeDGS):
     """Only train.py: it also renders the test views, or the observer does when it is done."""
 
@@ -236,7 +246,8 @@ class DBS(InOneProcess):
 
 
 SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDGS, "taming": Taming, "2dgs": TwoDGS,
-                                     "dbs": DBS, "c3dgs": C3DGS, "hac": HAC, "hac-plus": HAC}
+                                     "dbs": DBS, "c3dgs": C3DGS, "compact-3dgs": Compact3DGS, "hac": HAC,
+                                     "hac-plus": HAC}
 
 
 def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:

@@ -217,6 +217,7 @@ def test_a_checkout_must_have_the_same_split(names, wrong):
     ("3dgs-2023", {"strategies": ["steady"]}, ["--opacity_reset_interval", str(ITERATIONS + 1)], [], {}),
     ("3dgs-2023", {}, ["--blend_mode", "smoe", "--background_gate", "0.0"], [], {}),
     ("3dgs-2023", {"background_gates": [0.3]}, ["--blend_mode", "smoe", "--background_gate", "0.3"], [], {}),
+    ("compact-3dgs", {}, ["--comp", "--store_npz"], [], {}),
     ("3dgs-2023", {"blend_mode": "paper"}, ["--blend_mode", "smoe", "--background_gate", "0.0"], [], {}),
     ("3dgs-2023", {"blend_mode": "alpha"}, ["--blend_mode", "alpha"], ["--background_gate"], {}),
     ("3dgs-2023", {}, [], ["--opacity_reset_interval", "--opacity_lr"], {}),

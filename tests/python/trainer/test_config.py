@@ -23,9 +23,10 @@ PUBLISHED = {
 
 
 def parse(*arguments):
+    """With the recipe of 3DGS, which reads no scene, unless another strategy is named."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    return config_from_arguments(parser.parse_args(["scene", "-o", "out", *arguments]))
+    return config_from_arguments(parser.parse_args(["scene", "-o", "out", "--strategy", "3dgs", *arguments]))
 
 
 def test_defaults_are_those_of_3dgs():

@@ -122,11 +122,11 @@ def test_ply_round_trip(tmp_path, mode, sh_degree):
         assert torch.equal(loaded.raw[name], model.raw[name]), name
 
 
-def test_blend_mode_of_a_file_is_never_guessed():
+def test_a_file_that_records_no_blend_mode_is_alpha_and_says_so(capsys):
     assert agreed_blend_mode("a.ply", "smoe", None) == "smoe"
     assert agreed_blend_mode("a.ply", None, "alpha") == "alpha"
-    with pytest.raises(TrainerError, match=r"a\.ply does not say which blend mode.*--blend-mode"):
-        agreed_blend_mode("a.ply", None, None)
+    assert not capsys.readouterr().err and agreed_blend_mode("a.ply", None, None) == "alpha"
+    assert "note: a.ply records no blend mode, so it is alpha" in capsys.readouterr().err
     with pytest.raises(TrainerError, match="trained with the blend mode smoe, not alpha"):
         agreed_blend_mode("a.ply", "smoe", "alpha")
     with pytest.raises(TrainerError, match="'future'"):

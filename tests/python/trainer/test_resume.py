@@ -317,8 +317,8 @@ def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, mon
     config = dataclasses.replace(tiny_config, eval_every=10)
     train(config, progress=False)
     assert sorted(os.listdir(config.output)) == [
-        ".dsmoe.json", ".dsmoe.lock", "checkpoint.pt", "config.json", "history.json", "loss.png", "per_view.json",
-        "point_cloud", "results.json"]
+        ".dsmoe.json", ".dsmoe.lock", "cameras.json", "checkpoint.pt", "config.json", "history.json", "loss.png",
+        "per_view.json", "point_cloud", "results.json"]
     kill_at(monkeypatch, 5)
     with pytest.raises(Killed):
         train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)
