@@ -111,7 +111,7 @@ def needed_packages(files: Mapping[str, bytes]) -> Set[str]:
 def of_files(files: Mapping[str, bytes]) -> Set[str]:
     """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "returns color, radii".
 
-    files: those of a checkout, by name. One that is no Python shows nothing: a rule will say so.
+    files: those of a checkout, by name. One that is not Python shows nothing: a rule will say so.
     """
     return set().union(*_of_each(files).values())
 

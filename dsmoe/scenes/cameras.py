@@ -68,7 +68,7 @@ def quaternion_to_rotation(quaternion: Sequence[float]) -> np.ndarray:
     w, x, y, z = np.asarray(quaternion, np.float64)
     length = np.sqrt(x * x + y * y + z * z + w * w)
     if length == 0:
-        raise ValueError("the quaternion is 0, which is no rotation; one of its numbers must not be 0")
+        raise ValueError("the quaternion is 0, which is not a rotation; one of its numbers must not be 0")
     w, x, y, z = w / length, x / length, y / length, z / length
     return np.array([[x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
                      [2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)],

@@ -161,7 +161,7 @@ class DirectPasses(Passes):
                ) -> ViewStep:
         (shown,) = views
         stored, lazy = self.model.stored, self.optimizer.lazy_colors()
-        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
+        # Weak: parameters that a densification replaces are freed at once, not at the next rendering.
         self._rendered = {name: weakref.ref(tensor) for name, tensor in stored.items()}
         self._activate()
         steps = lazy.begin_catch_up()

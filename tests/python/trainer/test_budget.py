@@ -474,7 +474,7 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
     costs, errors = torch.full((count,), 5.0), torch.zeros(count)
     costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
     strategy.needed += len(trainer.scene.train)
-    errors[7] = 1e6  # the cheapest is no place for another one
+    errors[7] = 1e6  # the cheapest is not a place for another one
     strategy.costs, strategy.errors = costs, errors
     monkeypatch.setattr(strategy, "_look_at_the_rest", lambda: None)
     moved = []

@@ -404,7 +404,7 @@ def test_nothing_is_written_or_removed_where_a_link_leads_out_of_the_folder(tiny
     assert before == {path: os.path.getmtime(path) for path, _, _ in os.walk(elsewhere)}
     os.remove(path)
     os.symlink(str(tmp_path / "nowhere"), path)
-    with pytest.raises(TrainerError, match="nowhere.* by a link|point_cloud is no folder"):
+    with pytest.raises(TrainerError, match="nowhere.* by a link|point_cloud is not a folder"):
         train(config, overwrite=True, progress=False)
     os.rename(output, str(tmp_path / "real"))
     os.symlink(str(tmp_path / "real"), output)  # the folder itself may be one

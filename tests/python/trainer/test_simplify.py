@@ -314,7 +314,7 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
 
 @pytest.mark.parametrize("edit, words", [
     (lambda entry: entry.pop("fx"), "'fx' is missing"),
-    (lambda entry: entry.update(rotation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "is no rotation"),
+    (lambda entry: entry.update(rotation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "is not a rotation"),
     (lambda entry: entry.update(position=[0, float("nan"), 0]), "must be finite"),
     (lambda entry: entry.update(width=0), "must be above 0"),
     (lambda entry: entry.update(img_name="view_002.png"), "two cameras have one `img_name`"),
