@@ -60,9 +60,11 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        trains = arguments.command in ("train", "simplify")
-        continues = trains and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
-        hint = f"; continue it with: {_resume_command(arguments.output)}" if continues else ""
+        output = getattr(arguments, "output", None) or ""
+        continues = os.path.isfile(os.path.join(output, CHECKPOINT_NAME))
+        hint = f"; continue it with: {_resume_command(output)}" if continues and arguments.command == "train" else ""
+        if continues and arguments.command == "simplify":
+            hint = "; the same command with --resume continues"
         if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
