@@ -21,8 +21,8 @@ unsigned resident_blocks(int64_t pieces) {
   return static_cast<unsigned>(min(pieces, int64_t(kResidentBlocks) * num_multiprocessors()));
 }
 
-// The memory of a call. `capacity` is the room of each kind of list. Macro tiles seldom have the longer lists: only where
-// many Gaussians meet a macro tile by their bounding box and not by their ellipse.
+// The memory of a call. `capacity` is the room of each kind of list. Macro tiles seldom have the longer lists: only
+// where many Gaussians meet a macro tile by their bounding box and not by their ellipse.
 template <class Key> struct Room {
   template <class S>
   Room(const Frame<S>& frame, const Work& work)
