@@ -4,8 +4,8 @@ from __future__ import annotations
 import torch
 
 from .autograd import INPUTS, OPTIONS
-from .checks import check_tensor
-from .extension import BACKENDS, build_info
+from .checks import check_tensor, refuse_device
+from .extension import BACKENDS
 from .learned_gate import gate_of
 from .raw_values import look_for_raw_values
 from .settings import BLEND_MODES, FEATURE_OUTPUTS, OUTPUTS, Rendering, resolve_blend, resolve_faint_below
@@ -102,9 +102,7 @@ def tensor_checks(function, first_name, first):
     device = getattr(first, "device", None)
     required(first_name, first)
     if device.type not in BACKENDS:
-        reason = build_info()["without_cuda_because"] if device.type == "cuda" else None
-        raise TypeError(f"{function}: {first_name} is on {device}; this build renders on "
-                        f"{' and '.join(BACKENDS)}" + (f": {reason}" if reason else ""))
+        refuse_device(function, first_name, first)
     return required, optional
 
 

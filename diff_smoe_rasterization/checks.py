@@ -1,10 +1,19 @@
 """Types of arguments: what torch would refuse without the function's name, or with an AttributeError."""
 from __future__ import annotations
 
+import functools
 import numbers
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
+
+
+@functools.lru_cache(maxsize=None)
+def has_kernels() -> bool:
+    """Whether this build renders on a GPU."""
+    from .extension import BACKENDS  # which loads the ops; the oracle does without
+
+    return "cuda" in BACKENDS
 
 
 def check_tensor(function: str, name: str, value: Any) -> None:
@@ -15,6 +24,15 @@ def check_tensor(function: str, name: str, value: Any) -> None:
         raise TypeError(f"{function}: {name} is sparse ({value.layout}); it must be dense: {name}.to_dense()")
 
 
+def refuse_device(function: str, name: str, value: torch.Tensor) -> NoReturn:
+    """Raises TypeError: this build has no code for a tensor's device. For a GPU it says why: a build hides that."""
+    from .extension import BACKENDS, build_info
+
+    reason = build_info()["without_cuda_because"] if value.device.type == "cuda" else None
+    raise TypeError(f"{function}: {name} is on {value.device}; this build renders on {' and '.join(BACKENDS)}"
+                    + (f": {reason}" if reason else ""))
+
+
 def check_tensors(function: str, **values: Any) -> None:
     """Raises TypeError if one of the named arguments of a function is not a dense tensor, or on another device."""
     first_name, device = "", None
@@ -22,6 +40,8 @@ def check_tensors(function: str, **values: Any) -> None:
         check_tensor(function, name, value)
         if device is None:
             first_name, device = name, value.device
+            if device.type == "cuda" and not has_kernels():
+                refuse_device(function, name, value)
         elif value.device != device:
             raise TypeError(f"{function}: {name} is on {value.device}; it must be on {device}, as {first_name} is")
 

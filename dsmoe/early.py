@@ -42,6 +42,8 @@ def check_early(arguments: argparse.Namespace) -> None:
 
 def _check_options(arguments: argparse.Namespace) -> None:
     """Raises ConfigError for a number that no strategy and no preset takes."""
+    if getattr(arguments, "init", ""):  # that model says how it is blended
+        return
     arguments = copy.copy(arguments)
     take_paper(arguments)
     given = {**given_options(arguments), "device": "cpu", "strategy": "steady", "strategy_options": ""}

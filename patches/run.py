@@ -107,6 +107,8 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     warnings += [f"the results are told by what the trainer calls them: {one} ({name})"
                  for name, one in flavours.items() if "," in one and one not in ("color,radii", trainer)]
     warnings += [f"{name} computes something else: an import of it fails here" for name in blocked]
+    warnings += [f"the trainer may call gsplat's {name}, which this package has not: that ends the command"
+                 for name in sorted(facts.those(found, "calls gsplat's ")) if name.startswith("rasterization")]
     shown = {facts.OF_GSPLAT: flavour} if flavour == facts.OF_GSPLAT else flavours
     will_be = ", ".join(f"{', '.join(name for name in shown if shown[name] == one)} will be {one}"
                         for one in dict.fromkeys(shown.values()))

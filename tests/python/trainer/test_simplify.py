@@ -348,7 +348,7 @@ def test_ctrl_c_keeps_the_model_and_resume_ends_where_it_would_have(run, tmp_pat
             assert main([*words, "-o", broken]) == 130
     finally:
         signal.signal(signal.SIGINT, before)
-    assert capsys.readouterr().err.endswith("interrupted; continue it with --resume\n")
+    assert capsys.readouterr().err.endswith(f"-o {broken} --resume\n")
     assert main(["export", broken, "-o", str(tmp_path / "sofar.ply")]) == 0
     assert 40 < len(io.read_gaussians(tmp_path / "sofar.ply").means3D), "the checkpoint's"
     assert main([*words, "-o", broken, "--resume"]) == 0
