@@ -27,7 +27,7 @@ from diff_smoe_rasterization.settings import (
 )
 
 STAND_INS = Path(__file__).resolve().parent / "stand_ins"
-OPTIONS = ("blend_mode", "background_gate", "faint_below")  # as cfg_args records them; the last one is no flag
+OPTIONS = ("blend_mode", "background_gate", "faint_below")  # as cfg_args records them; the last one is not a flag
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first

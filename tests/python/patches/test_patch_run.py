@@ -237,7 +237,7 @@ IN_FUNCTION = ("def render_{2}():\n    from {0} import GaussianRasterizationSett
 
 
 def test_each_package_is_told_by_its_own_calls(tmp_path, monkeypatch):
-    """Classes of the file's own are no rasterizer's, and one that is unknown is kept away where another is there."""
+    """Classes of the file's own are not a rasterizer's, and one that is unknown is kept away where another is there."""
     words = [sys.executable, "train.py"], "smoe", None, environment()
     known = (IN_FUNCTION.format("diff_gaussian_rasterization_abs", "image, radii, depth_image", 1, "antialiasing=1")
              + IN_FUNCTION.format("diff_gaussian_rasterization", "image, radii", 2, "")
