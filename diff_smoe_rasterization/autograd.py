@@ -21,7 +21,7 @@ _CAN_REGISTER = hasattr(torch.library, "register_autograd")
 INPUTS, IMAGES = _core.inputs, _core.images
 """The names of the op's tensors, and of the images among its results. csrc/torch/fields.h lists them."""
 
-_PYTHON_TYPES = {"SymInt": int, "int": int, "float": float, "bool": bool}
+_PYTHON_TYPES = {"SymInt": int, "int": int, "float": float, "float[]": list, "bool": bool}
 OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _core.options.items()}
 """The op's other arguments with their types, in order: what `csrc/torch/fields.h` lists."""
 
@@ -232,7 +232,7 @@ def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
     return _fake_gradients(inputs, present, others[-1])
 
 
-def _fake_mark_visible(positions, viewmatrix, near):
+def _fake_mark_visible(positions, viewmatrix, near, camera_model):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
 
 

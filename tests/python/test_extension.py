@@ -21,6 +21,7 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.core import _core
+from diff_smoe_rasterization.footprints import image_numbers
 from diff_smoe_rasterization.settings import (
     _FIXED_GATES,
     BLEND_MODES,
@@ -350,7 +351,7 @@ def every_call():
     inputs = {name: backward[name] for name in ("inputs", "present")}
     belongs = [here and name not in ("bg", "background_gate") for name, here in zip(_core.inputs, inputs["present"])]
     camera = [scene.settings.viewmatrix, scene.settings.projmatrix, scene.settings.campos]
-    view = {"cameras": camera, "images": [20.0, 18.0, 1.0, 1.0], "depth": False, "inverse_depth": False}
+    view = {"cameras": camera, "images": image_numbers(scene.settings), "depth": False, "inverse_depth": False}
     counted = {"radii": torch.zeros(1, 20, dtype=torch.int32), "offsets": torch.tensor([[0, 1]], dtype=torch.int32)}
     wide = torch.zeros(1, 4)
     depth = random_normal((20,), 1, torch.float32)

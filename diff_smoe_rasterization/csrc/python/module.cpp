@@ -27,6 +27,7 @@ py::dict constants() {
   out["gate_cut"] = kGateCut;
   out["core_kernel"] = kCoreKernel;
   out["most_views"] = kMostViews;
+  out["most_lens_numbers"] = 2 + kMostDistortion;
   out["core_alpha"] = kCoreAlpha;
   out["tail_alpha"] = kTailAlpha;
   out["every_tail_alpha"] = kEveryTailAlpha;

@@ -177,7 +177,8 @@ struct Cpu {
     cpu::project_rows_backward(batch, gradients);
   }
 
-  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {
+  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near,
+                        int64_t camera_model) {
     const Tensor visible = empty({positions.size(0)}, positions, kBool);
     dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
@@ -186,6 +187,7 @@ struct Cpu {
       frame.inputs.means3D = positions.data_ptr<S>();
       std::copy_n(view.data_ptr<S>(), 16, frame.camera.view);
       frame.camera.near = static_cast<float>(near);
+      frame.camera.lens.model = static_cast<LensModel>(camera_model);
       cpu::mark_visible(frame, visible.data_ptr<bool>());
     });
     return visible;

@@ -219,7 +219,8 @@ struct Cuda {
     cuda::project_rows_backward(batch, gradients, {current_stream()});
   }
 
-  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {
+  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near,
+                        int64_t camera_model) {
     const Tensor visible = empty({positions.size(0)}, positions, kBool);
     dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
@@ -228,6 +229,7 @@ struct Cuda {
       frame.inputs.means3D = positions.data_ptr<S>();
       frame.camera.view = view.data_ptr<S>();
       frame.camera.near = static_cast<float>(near);
+      frame.camera.lens.model = static_cast<LensModel>(camera_model);
       cuda::mark_visible(frame, visible.data_ptr<bool>(), {current_stream()});
     });
     return visible;
