@@ -56,7 +56,8 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
                 raise ValueError(f"{function}: {name} is {value!r}; it must be {_KINDS[kind]}")
     faint_below = resolve_faint_below(blend_mode, settings.faint_below)
     model, lens = resolve_lens(settings)
-    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens, *[name in outputs for name in FEATURE_OUTPUTS]]
+    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens,
+                *[name in outputs for name in FEATURE_OUTPUTS]]
     for place, value in zip(_COMPUTED_OPTIONS.values(), computed):
         options.insert(place, value)
     return options

@@ -256,8 +256,9 @@ def visible(gaussians, settings, mode):
 
     splats = project(_rows(gaussians, finite), settings)
     in_front = splats.depth > _float32(settings.near)  # not so if it is NaN: beyond the lens's range
-    if settings.prefiltered and not in_front.all():
-        index = finite[~in_front][0].item()
+    too_near = splats.depth <= _float32(settings.near)
+    if settings.prefiltered and too_near.any():
+        index = finite[too_near][0].item()
         raise ValueError(f"rasterize: prefiltered is set, but means3D[{index}] is not beyond the near plane")
     xx, xy, yy = splats.covariance.unbind(1)
     det = xx * yy - xy * xy
@@ -408,7 +409,7 @@ def distortion_end(model, numbers, end):
 
 
 def slope_limits(numbers, focal, principal, size):
-    """Returns FRUSTUM_MARGIN times the greatest |x/z| and |y/z| on the image's edges and corners, by the radial part."""
+    """Returns FRUSTUM_MARGIN times the largest |x/z| and |y/z| of the image's edges and corners, by the radial part."""
     over, under, *_ = _terms("opencv", numbers)
     end = distortion_end("opencv", numbers, MOST_SLOPE)
     edge = [max(centre, side - centre) / scale for centre, side, scale in zip(principal, size, focal)]

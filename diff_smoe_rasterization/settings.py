@@ -40,21 +40,20 @@ At lambda 1 `smoe_eq7` is alpha blending.
 CAMERA_MODELS = ("pinhole", "orthographic", "opencv", "fisheye", "thin_prism_fisheye", "equirectangular")
 """The camera models, by number in the C++ core.
 
-================== ================================================ ========================================= ======
-name               distortion                                       what it sees                              depth
-================== ================================================ ========================================= ======
-pinhole            none: its projection is `projmatrix`             view z above `near`                       view z
-orthographic       none; focal lengths are pixels by unit of length view z above `near`                       view z
-opencv             k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4              to where the distorted radius stops       view z
-fisheye            k1 k2 k3 k4 (Kannala-Brandt)                     to the angle at which it stops, beyond 90 \|p\|
-                                                                    degrees too, and at most 174.6
-thin_prism_fisheye k1 k2 p1 p2 k3 k4 sx1 sy1                        the same                                  \|p\|
-equirectangular    none                                             all directions, but 0.06 degrees at poles \|p\|
-================== ================================================ ========================================= ======
+================== =============================================== ================================== ========
+name               distortion                                      what it sees                       depth
+================== =============================================== ================================== ========
+pinhole            none; its projection is `projmatrix`            depths above `near`                view z
+orthographic       none; focal lengths in pixels by unit of length depths above `near`                view z
+opencv             k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4             until the distorted radius stops   view z
+fisheye            k1 k2 k3 k4 (Kannala-Brandt)                    until it stops; 174.6 degrees      distance
+thin_prism_fisheye k1 k2 p1 p2 k3 k4 sx1 sy1                       until it stops; 174.6 degrees      distance
+equirectangular    none                                            all but 0.06 degrees at the poles  distance
+================== =============================================== ================================== ========
 
-\|p\| is the distance from the camera; `near`, the order of the Gaussians and the depth images take it so. `opencv` has
-the first 0, 1, 2, 4, 5, 8 or 12 of its numbers, `fisheye` 0, 1, 2 or 4. COLMAP's OPENCV and FULL_OPENCV are `opencv`, and
-its OPENCV_FISHEYE is `fisheye`, each with the same order of numbers.
+`near`, the order of the Gaussians and the depth images take the depth so. `opencv` has the first 0, 1, 2, 4, 5, 8 or 12
+of its numbers, `fisheye` 0, 1, 2 or 4. COLMAP's OPENCV and FULL_OPENCV are `opencv`, and its OPENCV_FISHEYE is
+`fisheye`, with their numbers in the same order.
 """
 
 _FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_eq7": None, "smoe_tn": 0.0, "smoe_std": 0.0}

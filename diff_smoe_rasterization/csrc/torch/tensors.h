@@ -257,7 +257,7 @@ template <class S> Lens<S> lens_of(const Options& options) {
   of.fx = of.width / (2 * options.tanfovx), of.fy = of.height / (2 * options.tanfovy);
   of.cx = options.lens[0], of.cy = options.lens[1];
   of.distortion.assign(options.lens.begin() + kPrincipal, options.lens.end());
-  return dsmoe::lens_of<S>(of);
+  return dsmoe::lens_of(of).as<S>();
 }
 
 // Everything of a rendering but its camera's tensors and what it saved.

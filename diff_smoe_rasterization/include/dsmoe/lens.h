@@ -45,6 +45,19 @@ template <class S> struct Lens {
   Distortion<S> distortion;
   Vec2<S> slope_limit = {};  // kOpencv: the Jacobian is taken at most at these |x/z| and |y/z|
   S range = 0;               // a radius on the plane. What lies beyond is not seen. kEquirectangular: see there
+
+  template <class To> Lens<To> as() const {
+    Lens<To> to;
+    to.model = model;
+    to.focal = {To(focal.x), To(focal.y)}, to.principal = {To(principal.x), To(principal.y)};
+    const auto copy = [](const auto& from, auto& into) {
+      for (size_t i = 0; i < sizeof(from) / sizeof(from[0]); ++i) into[i] = To(from[i]);
+    };
+    copy(distortion.numerator, to.distortion.numerator), copy(distortion.denominator, to.distortion.denominator);
+    copy(distortion.tangential, to.distortion.tangential), copy(distortion.prism, to.distortion.prism);
+    to.slope_limit = {To(slope_limit.x), To(slope_limit.y)}, to.range = To(range);
+    return to;
+  }
 };
 
 // The angle to the axis at which every fisheye ends, radians: near 180 degrees a point becomes a ring.
@@ -378,16 +391,16 @@ inline double stretch(const Distortion<double>& d, double range, double r) {
 constexpr double kMostSlope = 1e3;
 
 // The lens of a calibration. Throws std::invalid_argument for what cannot be one.
-template <class S> Lens<S> lens_of(const LensCalibration& of) {
+inline Lens<double> lens_of(const LensCalibration& of) {
   using namespace lens_making;
   const int model = static_cast<int>(of.model);
   if (model < 0 || model >= kNumLensModels) {
     throw std::invalid_argument("lens_of: camera_model is " + std::to_string(model) + "; it must be 0 to " +
                                 std::to_string(kNumLensModels - 1));
   }
-  const Distortion<double> d = distortion_of(of);
-  Lens<S> lens;
+  Lens<double> lens;
   lens.model = of.model;
+  const Distortion<double>& d = lens.distortion = distortion_of(of);
   if (of.model == LensModel::kPinhole) return lens;
   double fx = of.fx, fy = of.fy, cx = of.cx, cy = of.cy;
   if (of.model == LensModel::kEquirectangular) {
@@ -401,16 +414,11 @@ template <class S> Lens<S> lens_of(const LensCalibration& of) {
   if (!is_finite(cx) || !is_finite(cy)) {
     refuse_lens(of, "principal_point is ", cx, ", ", cy, "; it must be finite");
   }
-  lens.focal = {S(fx), S(fy)}, lens.principal = {S(cx - 0.5), S(cy - 0.5)};
-  const auto copy = [](const auto& from, auto& to) {
-    for (size_t i = 0; i < sizeof(from) / sizeof(from[0]); ++i) to[i] = S(from[i]);
-  };
-  copy(d.numerator, lens.distortion.numerator), copy(d.denominator, lens.distortion.denominator);
-  copy(d.tangential, lens.distortion.tangential), copy(d.prism, lens.distortion.prism);
+  lens.focal = {fx, fy}, lens.principal = {cx - 0.5, cy - 0.5};
   const bool slopes = of.model == LensModel::kOpencv;
   if (!slopes && of.model != LensModel::kFisheye && of.model != LensModel::kThinPrismFisheye) return lens;
   const double range = range_of(d, slopes ? kMostSlope : kFisheyeEnd, slopes);
-  lens.range = S(range);
+  lens.range = range;
   const double distorted = range * radial_of(d, range * range).value;
   if (!(distorted * std::fmax(fx, fy) >= 1)) {  // not even a pixel of the image
     refuse_lens(of, "distortion folds the image back at ", distorted * std::fmax(fx, fy),
@@ -419,8 +427,8 @@ template <class S> Lens<S> lens_of(const LensCalibration& of) {
   if (slopes) {
     const double u = std::fmax(cx, of.width - cx) / fx, v = std::fmax(cy, of.height - cy) / fy;
     const double corner = stretch(d, range, std::hypot(u, v));
-    lens.slope_limit = {S(kFrustumMargin * u * std::fmax(corner, stretch(d, range, u))),
-                        S(kFrustumMargin * v * std::fmax(corner, stretch(d, range, v)))};
+    lens.slope_limit = {kFrustumMargin * u * std::fmax(corner, stretch(d, range, u)),
+                        kFrustumMargin * v * std::fmax(corner, stretch(d, range, v))};
   }
   return lens;
 }

@@ -67,6 +67,13 @@ template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, TileGrid grid, 
   return {0, 0, grid.columns, grid.rows};
 }
 
+// What comes back from a Gaussian's pixels.
+template <class S> struct ProjectedGradient {
+  GateGradient<S> gate;
+  S depth, inverse_depth;  // by the depth and its inverse; 0 if nothing asks for them
+  Vec3<S> color;           // by the mean, on the way of the colour
+};
+
 // What comes back to a point in view space, and to the camera's projection.
 template <class S> struct ViewGradient {
   Vec3<S> view;
@@ -83,12 +90,13 @@ template <class S> struct ByMatrix {
   DSMOE_HD bool sees(const Point&) const { return true; }
   DSMOE_HD Vec2<S> pixel(Vec3<S> mean, const Point&) const { return project_to_pixel(camera, mean); }
 
-  DSMOE_HD ViewGradient<S> backward(Vec3<S> mean, Vec3<S>, const Point& point, const Mat23<S>& dL_dJ, S dL_ddepth,
-                                    Vec2<S> dL_dpixel) const {
+  DSMOE_HD ViewGradient<S> backward(Vec3<S> mean, Vec3<S> view, const Point& point, const Mat23<S>& dL_dJ,
+                                    const ProjectedGradient<S>& g, bool inverse_depth) const {
     ViewGradient<S> out;
     out.view = projection_jacobian_backward(point, dL_dJ);
-    out.view.z += dL_ddepth;
-    out.pixel = project_to_pixel_backward(camera, mean, dL_dpixel);
+    out.view.z += g.depth;
+    if (inverse_depth) out.view.z -= g.inverse_depth / (view.z * view.z);
+    out.pixel = project_to_pixel_backward(camera, mean, g.gate.mean);
     return out;
   }
 
@@ -108,9 +116,11 @@ template <class S> struct ByLens {
   DSMOE_HD bool sees(const Point& point) const { return point.seen; }
   DSMOE_HD Vec2<S> pixel(Vec3<S>, const Point& point) const { return point.pixel; }
 
-  DSMOE_HD ViewGradient<S> backward(Vec3<S>, Vec3<S> view, const Point&, const Mat23<S>& dL_dJ, S dL_ddepth,
-                                    Vec2<S> dL_dpixel) const {
-    return {through_lens_backward(camera.lens, view, dL_dpixel, dL_dJ) +
+  DSMOE_HD ViewGradient<S> backward(Vec3<S>, Vec3<S> view, const Point&, const Mat23<S>& dL_dJ,
+                                    const ProjectedGradient<S>& g, bool inverse_depth) const {
+    S dL_ddepth = g.depth;
+    if (inverse_depth) dL_ddepth -= g.inverse_depth / (depth(view) * depth(view));
+    return {through_lens_backward(camera.lens, view, g.gate.mean, dL_dJ) +
                 view_depth_backward(camera.lens.model, view, dL_ddepth),
             {}};
   }
@@ -193,13 +203,6 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
   return project_by(ByLens<S>{camera}, gaussian, rules);
 }
 
-// What comes back from a Gaussian's pixels.
-template <class S> struct ProjectedGradient {
-  GateGradient<S> gate;
-  S depth, inverse_depth;  // by the depth and its inverse; 0 if nothing asks for them
-  Vec3<S> color;           // by the mean, on the way of the colour
-};
-
 template <class S> struct GaussianGradient {
   Vec3<S> mean;
   Vec2<S> mean2D;  // dL/dpixel times (W / 2, H / 2): what densification reads
@@ -242,12 +245,7 @@ DSMOE_HD GaussianGradient<S> project_backward_by(const Way& way, const Gaussian<
 
   const Mat3<S> view_axes = view_rotation(camera.view);
   const Mat23<S> dL_dJ = {view_axes * dL_daxes.r0, view_axes * dL_daxes.r1};
-  S dL_ddepth = g.depth;
-  if (rules.inverse_depth) {
-    const S depth = way.depth(view);
-    dL_ddepth -= g.inverse_depth / (depth * depth);
-  }
-  const auto by = way.backward(gaussian.mean, view, made.point, dL_dJ, dL_ddepth, g.gate.mean);
+  const auto by = way.backward(gaussian.mean, view, made.point, dL_dJ, g, rules.inverse_depth);
   out.mean = transform_point_backward(camera.view, by.view) + by.pixel.point + g.color;
   out.mean2D = {g.gate.mean.x * S(0.5) * S(camera.width), g.gate.mean.y * S(0.5) * S(camera.height)};
   out.camera = {gaussian.mean, by.view, way.rotation_backward(made.point.jacobian, dL_daxes), by.pixel.clip,
