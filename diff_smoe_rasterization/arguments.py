@@ -7,6 +7,7 @@ from .autograd import INPUTS, OPTIONS
 from .checks import check_tensor
 from .extension import BACKENDS, build_info
 from .learned_gate import gate_of
+from .raw_values import look_for_raw_values
 from .settings import (
     BLEND_MODES,
     FEATURE_OUTPUTS,
@@ -30,6 +31,7 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
     for name, tensor in tensors.items():
         if tensor is not None:
             inputs[name] = optional(name, tensor)
+    look_for_raw_values(function, inputs, settings.debug)
     background_gate = gate_of(background_gate, blend_mode, inputs.values(), means3D)
     fixed_gate = background_gate
     if isinstance(background_gate, torch.Tensor):

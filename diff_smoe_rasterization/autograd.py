@@ -40,7 +40,12 @@ if not hasattr(_below_autograd, "__enter__"):  # torch 1.13 has it, but not as a
 _functorch = getattr(torch._C, "_functorch", None)  # before torch 2.0 it is a package of its own
 
 
-def _is_transformed():
+def is_compiling():
+    """Whether torch.compile traces the call."""
+    return _CAN_REGISTER and torch.compiler.is_compiling()
+
+
+def is_transformed():
     """Whether a transform of torch.func calls."""
     return _functorch is not None and _functorch.peek_interpreter_stack() is not None
 
@@ -50,8 +55,8 @@ def refuse_transforms(function, values):
 
     The ops would drop a tangent, and autograd.Function with a context does not know torch.func.
     """
-    compiling = _CAN_REGISTER and torch.compiler.is_compiling()
-    forward, transformed = forward_ad._current_level >= 0, not compiling and _is_transformed()
+    compiling = is_compiling()
+    forward, transformed = forward_ad._current_level >= 0, not compiling and is_transformed()
     if not forward and not transformed:  # asking each tensor would cost time
         return
     for value in values:

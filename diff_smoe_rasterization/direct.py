@@ -14,7 +14,7 @@ from .splats import Splats
 
 _OPS = torch.ops.diff_smoe_rasterization
 _COLORS, _BACKGROUND, _OPACITIES = INPUTS.index("colors_precomp"), INPUTS.index("bg"), INPUTS.index("opacities")
-_INSTANCES = [name for name, *_ in _core.saved["cuda"]].index("instances")
+_INSTANCES = {device: [name for name, *_ in saved].index("instances") for device, saved in _core.saved.items()}
 _RADII = IMAGES.index("radii")
 _KIND = [list(OPTIONS).index(name) for name in ("image_width", "image_height", "blend_mode")]
 _ABSENT = [INPUTS.index(name) for name in ("means2D", "dc", "shs", "background_gate")]
@@ -37,13 +37,13 @@ class DirectRendering:
             "DirectRendering", settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
             colors_precomp=colors_precomp, scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
         refuse_transforms("DirectRendering", self._inputs)
-        self._outputs = outputs
+        self._outputs, self._forgotten = outputs, False
         self._images: Optional[List[torch.Tensor]] = None
 
     @torch.no_grad()
     def visible_radii(self) -> torch.Tensor:
         """The radii [N] int32 that `render` will return for Gaussians of finite colours; colours are not read."""
-        inputs = list(self._inputs)
+        inputs = list(self._given("visible_radii"))
         for index in _ABSENT:
             inputs[index] = None
         # A radius does not depend on the colour. Any finite number does for one.
@@ -54,7 +54,7 @@ class DirectRendering:
     @torch.no_grad()
     def render(self) -> Rendering:
         """The images, without gradient. Neither they nor the arguments may be changed in place before `backward`."""
-        *self._images, self._saved = _OPS.rasterize(*self._inputs, *self._options, True)
+        *self._images, self._saved = _OPS.rasterize(*self._given("render"), *self._options, True)
         self._versions = [_version(tensor) for tensor in (*self._inputs, *self._images)]
         return as_rendering(self._images, self._outputs)
 
@@ -64,8 +64,9 @@ class DirectRendering:
 
     @property
     def room(self) -> int:
-        """On a GPU, after `render`: for how many tile instances there is room."""
-        return self._saved[_INSTANCES].numel()
+        """After `render`: for how many tile instances there is room. Raises RuntimeError before it."""
+        kind = self._rendered("room")[_RADII].device.type
+        return self._saved[_INSTANCES[kind]].numel()
 
     def recent_instances(self) -> int:
         """On a GPU: how many tile instances such renderings had at most lately, as far as it has counted; -1: unknown.
@@ -76,13 +77,14 @@ class DirectRendering:
         return _core.recent_instances(*(self._options[index] for index in _KIND), count)
 
     def forget_gaussians(self) -> None:
-        """Lets go of the arguments but for what `splats` takes; there is no `backward` any more.
+        """Lets go of the arguments but for what `splats` takes; what needs the others raises RuntimeError from now on.
 
         For a caller that has captured the calls in a CUDA graph: the graph knows where the arguments lie, and they may
         be replaced before the graph is.
         """
         self._inputs = [value if name in ("bg", "background_gate") else None
                         for name, value in zip(INPUTS, self._inputs)]
+        self._forgotten = True
 
     @torch.no_grad()
     def backward(self, dL_dimages: Dict[str, torch.Tensor], gradients: Dict[str, torch.Tensor]) -> None:
@@ -93,8 +95,8 @@ class DirectRendering:
         written whose radius is above 0. The others stay as they are. Raises RuntimeError before `render`, and if an
         argument or an image was changed in place since.
         """
-        images = self._rendered("backward")
-        for name, tensor, version in zip((*INPUTS, *IMAGES), (*self._inputs, *images), self._versions):
+        images, inputs = self._rendered("backward"), self._given("backward")
+        for name, tensor, version in zip((*INPUTS, *IMAGES), (*inputs, *images), self._versions):
             if _version(tensor) != version:
                 raise RuntimeError(f"DirectRendering.backward: {name} was changed in place since render; change it "
                                    "after backward, or change a copy")
@@ -112,6 +114,12 @@ class DirectRendering:
             [value for value in self._inputs if value is not None], [value is not None for value in self._inputs],
             images, self._saved, *self._options, True, [name in gradients for name in INPUTS],
             [gradients[name] for name in INPUTS if name in gradients])
+
+    def _given(self, function: str) -> List[Optional[torch.Tensor]]:
+        if self._forgotten:
+            raise RuntimeError(f"DirectRendering.{function}: forget_gaussians has let go of the arguments; call "
+                               f"{function} before it")
+        return self._inputs
 
     def _rendered(self, function: str) -> List[torch.Tensor]:
         if self._images is None:

@@ -87,8 +87,9 @@ def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: 
                       cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Footprints:
     """The first half of `rasterize`, whose arguments these are, but means2D_abs; it raises as `rasterize` does.
 
-    Gradients reach every tensor, but settings.bg and settings.background_gate, which belong to the second half. They
-    come from all numbers of the footprints, the reach included.
+    Gradients reach every tensor, but settings.bg and settings.background_gate, whose gradients the second half has.
+    They come from all numbers of the footprints, the reach included. In `smoe_eq7` the reach depends on background_gate
+    and alpha_min: give both halves the same, or the image is of neither.
     """
     inputs, options = op_arguments("project_gaussians", settings, outputs, means3D, opacities, means2D=means2D, dc=dc,
                                    shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
@@ -130,7 +131,8 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
     """The second half of `rasterize`: the images of footprints, of one projection or of several.
 
     Of the settings it takes the image's size, the background with its gate, the blend mode, alpha_min,
-    faint_below and deterministic. outputs: those that the footprints were projected for, `alpha` apart.
+    faint_below and deterministic. Blend mode, and in `smoe_eq7` gate and alpha_min, must be those of the projection:
+    they decide which pixels a footprint reaches. outputs: those that the footprints were projected for, `alpha` apart.
     Raises ValueError, TypeError or RuntimeError as `rasterize` does.
     """
     tensors, options = blend_op_arguments(footprints, settings, outputs)

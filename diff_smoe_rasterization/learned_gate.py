@@ -1,13 +1,16 @@
 """The background's gate lambda as a parameter of this process, which a trainer that cannot be edited learns.
 
 `background_gate="learned"` in the settings of a rendering takes it. The gate steps with the optimizer that holds the
-centres of the Gaussians; if none holds them, as they are computed, with the first that steps after a backward pass.
-Of an optimizer that is none of torch's it learns at the next rendering, by the centres that have changed in place.
+centres of the Gaussians; if none does, with the first that steps after a backward pass. Of an optimizer that is none of
+torch's it learns at the next rendering, by the centres that have changed in place. A trainer that replaces an optimizer
+and keeps the old one, between a backward pass and its step, costs the gate that step.
 """
 from __future__ import annotations
 
+import gc
 import importlib
 import math
+import warnings
 import weakref
 from typing import Any, Dict, Iterable, Optional, Sequence, Tuple, Union
 
@@ -62,7 +65,7 @@ class ProcessGate:
         self._centres: Any = None  # a weak reference to those of the last one, if they are a parameter
         self._version = 0  # of their values then
         self._holder: Any = None  # likewise to the optimizer that holds them
-        self._passed: Any = None  # likewise to an optimizer that stepped while the gate waited for its own
+        self._unheld: Any = None  # likewise to centres that no optimizer was found to hold
         self._put(torch.full((1,), math.log(START)))
 
     def _put(self, logarithm: torch.Tensor) -> None:
@@ -131,6 +134,12 @@ class ProcessGate:
         return value.to(like)
 
     def _begin(self) -> None:
+        distributed = torch.distributed
+        if not self._learns and distributed.is_available() and distributed.is_initialized() and (
+                distributed.get_world_size() > 1):
+            warnings.warn(f"diff_smoe_rasterization: each of the {distributed.get_world_size()} processes of this "
+                          "training learns a background gate of its own, by its own views, and records that; "
+                          "background_gate as a number is the same in all", stacklevel=2)
         self._learns = True
         if _HAS_HOOKS and self._hook is None:
             self._hook = _optimizers.register_optimizer_step_post_hook(self._after_step)
@@ -147,10 +156,10 @@ class ProcessGate:
         if not means3D.is_leaf or not means3D.requires_grad:
             self._centres = None
             return
-        before: Any = None if self._centres is None else self._centres()
+        before = _alive(self._centres)
         gradient = self._value.grad
         if gradient is not None and before is means3D and means3D._version != self._version and (
-                self._holder is None or self._holder() is None):
+                _alive(self._holder) is None):
             self._step(gradient)
             self._value.grad = None
         elif self._centres is not None and (before is None or before is means3D and means3D.grad is None):
@@ -160,22 +169,20 @@ class ProcessGate:
         self._centres, self._version = weakref.ref(means3D), means3D._version
 
     def _after_step(self, optimizer: Any, *_: Any) -> None:
+        centres, holder = _alive(self._centres), _alive(self._holder)
+        if centres is not None and optimizer is not holder and _holds(optimizer, centres):
+            holder, self._holder = optimizer, weakref.ref(optimizer)
         gradient = self._value.grad
         if gradient is None:
             return
-        centres = None if self._centres is None else self._centres()
-        holder = None if self._holder is None else self._holder()
-        if optimizer is not holder and centres is not None and any(
-                one is centres for group in optimizer.param_groups for one in group["params"]):
-            holder, self._holder = optimizer, weakref.ref(optimizer)
-        # Densification may have replaced the centres by others before the step. If their optimizer is not known, one
-        # that steps a second time is as good.
-        if self._centres is None or optimizer is holder or (
-                holder is None and self._passed is not None and self._passed() is optimizer):
+        if centres is not None and holder is None and _alive(self._unheld) is not centres:
+            holder = next((one for one in _all_optimizers() if _holds(one, centres)), None)
+            self._holder = None if holder is None else weakref.ref(holder)
+            self._unheld = weakref.ref(centres) if holder is None else None
+        # While the gate waits, densification may replace the centres in their optimizer, or both by others.
+        if self._centres is None or holder is None or optimizer is holder:
             self._step(gradient)
-            self._value.grad = self._passed = None
-        else:
-            self._passed = weakref.ref(optimizer)
+            self._value.grad = None
 
     @torch.no_grad()
     def _step(self, gradient: torch.Tensor) -> None:
@@ -183,6 +190,20 @@ class ProcessGate:
         finite = torch.nan_to_num(gradient, 0.0, 0.0, 0.0)
         step_gate(self._logarithm, self._adam, self._value, finite, RATE, BETAS, 0.0)
         self._found = None
+
+
+def _alive(reference: Any) -> Any:
+    """What a weak reference refers to; None if that is gone, or there is no reference."""
+    return None if reference is None else reference()
+
+
+def _holds(optimizer: Any, parameter: torch.Tensor) -> bool:
+    return any(one is parameter for group in optimizer.param_groups for one in group["params"])
+
+
+def _all_optimizers() -> Iterable[Any]:
+    """Those of torch's kind in this process: torch has no list of them."""
+    return (one for one in gc.get_objects() if issubclass(type(one), _optimizers.Optimizer))
 
 
 _optimizers: Any = importlib.import_module("torch.optim.optimizer")

@@ -14,7 +14,8 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     Raises ValueError if the shape does not fit or a coordinate is not finite, TypeError for another type.
     """
     check_tensors("distCUDA2", points=points)
-    from .extension import BACKENDS  # noqa: F401  (loading it registers the op)
+    from .autograd import refuse_transforms  # loading it registers the op
 
+    refuse_transforms("distCUDA2", [points])
     return torch.ops.diff_smoe_rasterization.mean_squared_neighbour_distances(points.detach())
 

@@ -6,7 +6,7 @@ from typing import Optional, Sequence, Tuple
 import torch
 
 from .arguments import as_rendering, op_arguments, tensor_checks, without_batch
-from .autograd import rasterize_op
+from .autograd import rasterize_op, refuse_transforms
 from .settings import GaussianRasterizationSettings, Rendering, resolve_lens
 from .splats import Splats
 
@@ -85,10 +85,11 @@ def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings
     tensor_checks("visible_radii", "means3D", means3D)
     with torch.no_grad():
         # A radius depends neither on the opacity nor on the colour.
+        of_each = means3D.new_zeros(means3D.shape[:1])
         inputs, options = op_arguments("visible_radii", settings._replace(bg=means3D.new_zeros(1)), (), means3D,
-                                       means3D.new_zeros(len(means3D)),
-                                       colors_precomp=means3D.new_zeros(len(means3D), 1),
+                                       of_each, colors_precomp=of_each.unsqueeze(-1),
                                        scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
+        refuse_transforms("visible_radii", inputs)
         return torch.ops.diff_smoe_rasterization.radii(*inputs, *options, False)
 
 
@@ -119,6 +120,7 @@ class GaussianRasterizer(torch.nn.Module):
         """Returns which positions [N, 3] have a depth above `near`, [N] bool."""
         required, _ = tensor_checks("markVisible", "positions", positions)
         viewmatrix = without_batch(required("viewmatrix", self.raster_settings.viewmatrix), 2)
+        refuse_transforms("markVisible", (positions, viewmatrix))
         model, _ = resolve_lens(self.raster_settings)
         return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near),
                                                               model)

@@ -67,8 +67,14 @@ _FAINT_BELOW = {"smoe": 0.25}
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
+FAINT_BELOW_VARIABLE = "DSMOE_FAINT_BELOW"
 LEARNED = "learned"
 """The background gate that this process learns, one for all its renderings (learned_gate.py)."""
+EVERYWHERE = 2.0
+"""The `faint_below` with which no pair is left out: no gate sum is above 1."""
+PAPER = "paper"
+PAPER_PROGRAM = {"blend_mode": "smoe", "background_gate": 0.0, "faint_below": EVERYWHERE}
+"""How the program of the paper's authors blends; PAPER stands for it on command lines and in suites."""
 MAX_BACKGROUND_GATE = 1e30  # that and a background's colour still make a float32 number
 
 BackgroundGate = Union[float, str, "torch.Tensor"]
@@ -96,7 +102,7 @@ class GaussianRasterizationSettings(NamedTuple):
     sh_degree: int  # active degree, 0 to 3; shs may hold more
     campos: torch.Tensor  # [3] camera centre, world
     prefiltered: bool = False  # the caller asserts that every point lies in front of the near plane
-    debug: bool = False  # check images and gradients for NaN; slower. Attributes: `strict`
+    debug: bool = False  # look for NaN in images and gradients, and for raw values; slower. Attributes: `strict`
     antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
     near: float = 0.2  # Gaussians with view depth <= near are culled
     # SMoE modes: also skip alpha below this; 0 is the paper's rule. `smoe`: pairs below this are no strong ones
@@ -111,8 +117,8 @@ class GaussianRasterizationSettings(NamedTuple):
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
     # `smoe` and `smoe_eq7`: faint pairs and tails count in pixels whose near pairs have a gate sum below this. 2: in
-    # all, as in the authors' program and in the text; slower. 0: in none. None: 0.25 in `smoe`, 2 in `smoe_eq7`.
-    # The other modes ignore it
+    # all, as in the authors' program and in the text; slower. 0: in none. None: $DSMOE_FAINT_BELOW, else 0.25 in
+    # `smoe`, 2 in `smoe_eq7`. The other modes ignore it
     faint_below: Optional[float] = None
     # One of CAMERA_MODELS. But for "pinhole", `viewmatrix` has all of the pose, `projmatrix` is not read and gets no
     # gradient, and the focal lengths are image_width / (2 tanfovx) and image_height / (2 tanfovy)
@@ -220,11 +226,21 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
     """Returns the gate sum of near pairs below which a rendering in this blend mode counts faint pairs and tails.
 
+    None means that of the process, else the environment variable DSMOE_FAINT_BELOW, for callers that cannot be edited,
+    else the mode's own.
     Raises ValueError for what is no number of 0 or more, or a greater one than MAX_BACKGROUND_GATE.
     """
+    if faint_below is None and blend_of_process is not None:
+        faint_below = blend_of_process[2]
     if faint_below is None:
-        return _FAINT_BELOW.get(blend_mode, 2.0)
+        asked = os.environ.get(FAINT_BELOW_VARIABLE)
+        return _weight(FAINT_BELOW_VARIABLE, asked) if asked else usual_faint_below(blend_mode)
     return _weight("faint_below", faint_below, text_counts=False, other=", or None")
+
+
+def usual_faint_below(blend_mode: str) -> float:
+    """Returns the `faint_below` of a blend mode if nothing says another."""
+    return _FAINT_BELOW.get(blend_mode, EVERYWHERE)
 
 
 def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:
@@ -285,8 +301,9 @@ def _is_tensor(value: Any) -> bool:
     return hasattr(value, "numel")
 
 
-# The blend mode and gate of the training that this process is, ahead of the variables: a patched trainer sets it.
-blend_of_process: Optional[Tuple[str, Optional[Union[float, str]]]] = None
+# Blend mode, gate and `faint_below` of the training that this process is, ahead of the variables: a patched trainer
+# sets it.
+blend_of_process: Optional[Tuple[str, Optional[Union[float, str]], Optional[float]]] = None
 
 
 def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, BackgroundGate]:
@@ -296,7 +313,7 @@ def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, Backgro
     """
     mode, gate = settings.blend_mode, settings.background_gate
     if mode is None and gate is None and blend_of_process is not None:
-        mode, gate = blend_of_process
+        mode, gate, _ = blend_of_process
     mode = resolve_blend_mode(mode)
     gate = resolve_background_gate(mode, gate)
     return "alpha" if mode == "smoe_eq7" and not _is_tensor(gate) and gate == 1 else mode, gate

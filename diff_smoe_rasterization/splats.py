@@ -5,7 +5,7 @@ from typing import Any, Optional, Sequence
 
 import torch
 
-from .autograd import INPUTS  # which also registers the ops
+from .autograd import INPUTS, refuse_transforms  # which also registers the ops
 from .checks import check_tensors
 from .settings import Contributions, GateMap, Importance
 
@@ -50,6 +50,7 @@ class Splats:
         Raises ValueError or TypeError if pixel_weights does not fit.
         """
         check_tensors("contributions", pixel_weights=pixel_weights)
+        refuse_transforms("contributions", [pixel_weights])
         return Contributions(*_OPS.contributions(pixel_weights.detach(), self._radii, self._saved,
                                                  self._background_gate, *self._options))
 
@@ -75,6 +76,7 @@ class Splats:
         if share_weights is None:
             share_weights = pixel_weights
         check_tensors("importance", pixel_weights=pixel_weights, share_weights=share_weights)
+        refuse_transforms("importance", [pixel_weights, share_weights])
         return Importance(*_OPS.importance(pixel_weights.detach(), share_weights.detach(), self._color, self._gate_sum,
                                            self._background, self._radii, self._saved, self._background_gate,
                                            *self._options))

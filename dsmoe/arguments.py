@@ -2,30 +2,39 @@
 from __future__ import annotations
 
 import argparse
-from typing import Iterator, List, Tuple
+import dataclasses
+from typing import Any, Iterator, List, Tuple
 
 from diff_smoe_rasterization._version import __version__
-from diff_smoe_rasterization.settings import BLEND_MODES
+from diff_smoe_rasterization.settings import BLEND_MODES, PAPER_PROGRAM
 
-from . import choices, fast
-from .bench.names import SELECTORS, SHIPPED
+from . import choices
+from .bench.names import SCENES, SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
-from .config import PRINCIPAL_POINTS
+from .config import PRINCIPAL_POINTS, TrainConfig
 from .config_arguments import add_arguments, number, whole_number
 from .patches import TRAINERS
+from .presets import BEST, FAST
 
 TRAIN_EXAMPLES = """examples:
-  dsmoe train garden -o garden_model                              the recipe of 3DGS
-  dsmoe train garden -o small --blend-mode smoe --budget 30000    a model of 30,000 Gaussians
-  dsmoe train garden -o fast --blend-mode smoe --fast             a result in seconds
-  dsmoe train garden -o quick --iterations 3000 --scale-recipe --resolution 4    minutes on a processor"""
+  dsmoe train garden -o garden_model                              as many Gaussians as the scene needs
+  dsmoe train garden -o small --blend-mode smoe --budget 30000    30,000 Gaussians
+  dsmoe train garden -o fast --fast                               in seconds on a GPU
+  dsmoe train garden -o quick --fast --resolution 4               in minutes on a processor
+  dsmoe train garden -o recipe --strategy 3dgs                    the recipe of 3DGS"""
+
+
+# Options of a training that `dsmoe simplify` offers as they are.
+SIMPLIFY_OPTIONS = ("images", "strict", "resolution", "test_every", "principal_point", "white_background", "blend_mode",
+                    "background_gate", "faint_below", "strategy_options", "device", "seed", "deterministic",
+                    "eval_every", "checkpoint_every")
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
     parser.add_argument("--version", action="version", version=f"dsmoe {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
                                 usage="%(prog)s SCENE -o OUT [OPTION ...]\n"
@@ -37,15 +46,20 @@ def build_parser() -> argparse.ArgumentParser:
                             "NeRF-synthetic scene; --resume finds it in OUT")
     train.add_argument("-o", "--output", metavar="OUT", default=argparse.SUPPRESS, help="folder to write")
     groups = add_arguments(train, skip=("scene", "output"))
+    _add_paper(groups["blending"])
     groups["length, and number of Gaussians"].add_argument(
         "--scale-recipe", action="store_true",
         help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
-             "keep their share of 30,000 steps, unless they are given")
-    groups["length, and number of Gaussians"].add_argument(
+             "keep their share of 30,000 steps, unless they are given; importance does so by itself")
+    presets = groups["length, and number of Gaussians"].add_mutually_exclusive_group()
+    presets.add_argument(
         "--fast", action="store_true",
-        help=f"a result in seconds on a GPU: {fast.ITERATIONS} iterations of the strategy importance, with early "
-             f"milestones; without --budget {fast.PER_POINT} Gaussians for each point of the scene, {fast.LEAST} to "
-             f"{fast.MOST}. Options that are given win")
+        help=f"a result in seconds on a GPU, by {FAST['cuda'].iterations} iterations with early milestones, or in "
+             f"minutes on a CPU, by {FAST['cpu'].iterations}. Options that are given win")
+    presets.add_argument(
+        "--best", action="store_true",
+        help=f"{BEST.iterations} iterations, and decisions that look at more views: better where the training views "
+             "gain too")
     earlier_run = groups["run"].add_mutually_exclusive_group()
     earlier_run.add_argument("--resume", action="store_true",
                              help="continue the run in OUT from its last checkpoint with its own options; more "
@@ -57,6 +71,13 @@ def build_parser() -> argparse.ArgumentParser:
         help="train on so many GPUs of this machine: torchrun starts this command once for each; with --batch N or "
              "more. auto: on all of them, but on no more than --batch keeps busy")
     groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
+
+    simplify = commands.add_parser(
+        "simplify", help="make a trained model smaller, in seconds on a GPU",
+        usage="%(prog)s MODEL [--scene SCENE] (--budget N | --keep X | --loses X) -o OUT [OPTION ...]",
+        description="Trains a model of 3DGS on to fewer Gaussians: those go that change its images least. Options of "
+                    "the scene that are not given are those that the model's folder records.")
+    _add_simplify_arguments(simplify)
 
     scene = commands.add_parser("scene", help="make a scene of photographs",
                                 description="Finds where photographs were taken, by COLMAP, and writes a scene for "
@@ -145,11 +166,13 @@ def build_parser() -> argparse.ArgumentParser:
     _add_patch_arguments(patch)
 
     run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
-                              usage="dsmoe run --blend-mode MODE [--background-gate V] [--trainer NAME] -- COMMAND ...",
+                              usage="dsmoe run (--paper | --blend-mode MODE) [OPTION ...] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
+    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES,
                      help="nothing records it: give the same where a trained model is rendered")
+    _add_paper(run)
+    run.add_argument("--faint-below", "--faint_below", type=number, metavar="X", help="as in train")
     run.add_argument("--background-gate", "--background_gate", metavar="V",
                      help="how much the background weighs: a number, 0 in the paper, or `learned` (default: "
                           "$DSMOE_BACKGROUND_GATE, else learned in smoe, 0 in smoe_eq7); models record it. smoe with "
@@ -171,9 +194,40 @@ def build_parser() -> argparse.ArgumentParser:
                                      description="Prints a script for the shell. In ~/.bashrc or, behind compinit, in "
                                                  "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
     completion.add_argument("shell", choices=("bash", "zsh"))
-    for command in (train, scene, evaluate, render, export, view, run, info, completion):
+    for command in (train, simplify, scene, evaluate, render, export, view, patch, run, bench, info, completion):
         command.set_defaults(command_parser=command)
     return parser
+
+
+def _add_simplify_arguments(simplify: argparse.ArgumentParser) -> None:
+    simplify.add_argument("model", metavar="MODEL",
+                          help="a .ply, .splat, .spz or .glb, an output folder of `dsmoe train`, or a model folder of "
+                               "3DGS")
+    simplify.add_argument("-o", "--output", metavar="OUT", required=True, help="folder to write, as of `dsmoe train`")
+    simplify.add_argument("--scene", help="folder of the photographs (default: as the model's folder says; if it is "
+                                          "not there, the images are the model's renderings at its cameras.json)")
+    stay = simplify.add_argument_group("number of Gaussians (one of these)").add_mutually_exclusive_group(
+        required=True)
+    stay.add_argument("--budget", type=whole_number, metavar="N", help="so many stay")
+    stay.add_argument("--keep", type=number, metavar="X", help="this part of them stays: 0.1, a tenth")
+    stay.add_argument("--loses", type=number, metavar="X",
+                        help="the fewest of a few numbers that lose at most X dB of PSNR on the training images")
+    groups = add_arguments(simplify, skip=[option.name for option in dataclasses.fields(TrainConfig)
+                                           if option.name not in SIMPLIFY_OPTIONS], defaults=False)
+    groups["length, and number of Gaussians"].add_argument(
+        "--iterations", type=whole_number, metavar="N", default=argparse.SUPPRESS,
+        help=f"steps of training (default: {choices.SIMPLIFY_ITERATIONS})")
+    earlier_run = groups["run"].add_mutually_exclusive_group()
+    earlier_run.add_argument("--resume", action="store_true", help="continue what was interrupted, with the same "
+                                                                   "options")
+    earlier_run.add_argument("--overwrite", action="store_true", help="replace the run in OUT")
+    groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def _add_paper(parser: Any) -> None:
+    parser.add_argument("--paper", action="store_true",
+                        help="blend as the program of the paper's authors: " + " ".join(
+                            f"--{name.replace('_', '-')} {value}" for name, value in PAPER_PROGRAM.items()))
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -185,7 +239,7 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
     parser.add_argument("--scene", help="folder " + scene)
     parser.add_argument("--blend-mode", choices=BLEND_MODES,
-                        help="needed for a .ply that does not record it; must agree where it does")
+                        help="of a .ply that does not record it (default: alpha); must agree where it does")
     parser.add_argument("--background-gate", type=number, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
     parser.add_argument("--white-background", action="store_true", default=None,
@@ -193,7 +247,7 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
 
 
 def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
-    actions = patch.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = patch.add_subparsers(dest="action", metavar="ACTION")
     for name, text in (("apply", "patch the checkout; each line of the patch says so"),
                        ("check", "say whether it is patchable, and what is patched of it"),
                        ("diff", "show what the patch changes, and write nothing"),
@@ -210,7 +264,7 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
 
 
 def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
-    actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = bench.add_subparsers(dest="action", metavar="ACTION")
     run = actions.add_parser("run", help="run what is not done yet of a suite",
                              description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
                                          "becomes a row with its reason, and the command returns 1.",
@@ -219,6 +273,10 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--device", choices=choices.DEVICES,
                      help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
+    run.add_argument("--iterations", type=whole_number, metavar="N",
+                     help="a trial: so many iterations, with the recipe squeezed into them; not for checkouts")
+    run.add_argument("--scenes", metavar="SCENES",
+                     help=f"in place of the suite's: a .yaml file, or a shipped one: {', '.join(sorted(SCENES))}")
     run.add_argument("--jobs", type=whole_number, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
                           "FPS stay out of the report)")

@@ -19,3 +19,4 @@ EXPORT_FORMATS = ("html", "ply", "splat", "spz", "glb")  # the first is the defa
 BAKE_ITERATIONS = 5000
 
 VIEW_HOST, VIEW_PORT = "127.0.0.1", 8080
+SIMPLIFY_ITERATIONS = 7000

@@ -10,15 +10,27 @@ from typing import TYPE_CHECKING, Any, Dict, List, Optional
 
 from .arguments import build_parser, completion_script
 from .config import CHECKPOINT_NAME, TrainConfig, holds_run
-from .config_arguments import config_from_arguments, given_options
+from .config_arguments import config_from_arguments, given_options, take_paper
+from .early import check_early
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .patches import PatchError
+from .presets import STRATEGY
 from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
+from .system.process import command
 
 if TYPE_CHECKING:
     from .results.evaluation import Measure
     from .system.group import Group
+
+
+OF_OTHERS = {  # what other trainers call an option of `dsmoe train`
+    **dict.fromkeys(("--steps", "--max-steps", "--num-steps", "--iters", "--max-iters", "--max-num-iterations"),
+                    "--iterations"),
+    **dict.fromkeys(("--cap-max", "--max-cap", "--max-gaussians", "--num-gaussians"), "--budget"),
+    **dict.fromkeys(("-m", "--model-path", "--out", "--result-dir", "--output-dir"), "--output"),
+    **dict.fromkeys(("-s", "--source-path", "--data", "--data-dir"), "SCENE"),
+    **dict.fromkeys(("--downscale-factor", "--data-factor"), "--resolution")}
 
 
 def main(argv: Optional[List[str]] = None) -> int:
@@ -27,10 +39,14 @@ def main(argv: Optional[List[str]] = None) -> int:
     print_any_name()
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
+    if not unknown and getattr(arguments, "action", True) is None or arguments.command is None:
+        getattr(arguments, "command_parser", parser).print_help(sys.stderr)
+        return 2
     arguments.command_words = list(sys.argv[1:] if argv is None else argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
         _refuse(unknown, getattr(arguments, "command_parser", parser))
     try:
+        check_early(arguments)
         status = COMMANDS[arguments.command](arguments) or 0
         sys.stdout.flush()
         return status
@@ -44,19 +60,33 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
-        hint = "; continue it with --resume" if continues else ""
+        trains = arguments.command in ("train", "simplify")
+        continues = trains and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
+        hint = f"; continue it with: {_resume_command(arguments.output)}" if continues else ""
         if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return exit_status(stop)
 
 
+def _resume_command(output: str) -> str:
+    """What to type to continue an interrupted training."""
+    words = [command(), "train", "--resume", "-o", shlex.quote(output)]
+    size = os.environ.get("WORLD_SIZE", "1")
+    if size == "1":
+        return " ".join(words)
+    if os.environ.get("LOCAL_WORLD_SIZE") == size and TrainConfig.load(output).device == "cuda":
+        return " ".join([*words, "--gpus", size])
+    return " ".join([*words, "(by torchrun, as before)"])
+
+
 def _refuse(unknown: List[str], parser: argparse.ArgumentParser) -> None:
     """Ends the command with its usage, the words that it does not know, and the options that may be meant."""
     options = [option for action in parser._actions for option in action.option_strings]
-    meant = [name for word in unknown if word.startswith("--")
-             for name in difflib.get_close_matches(word.partition("=")[0], options, n=1)]
+    typed = [word.partition("=")[0].replace("_", "-") for word in unknown if word.startswith("-")]
+    known = [name for name in map(OF_OTHERS.get, typed) if name in (*options, "SCENE")]
+    meant = known or [name for word in typed if word.startswith("--")
+                      for name in difflib.get_close_matches(word, options, n=1, cutoff=0.7)]
     parser.error("unrecognized arguments: " + " ".join(unknown)
                  + (f" (is {', '.join(meant)} meant?)" if meant else ""))
 
@@ -81,12 +111,16 @@ def _bench_run(arguments: argparse.Namespace) -> int:
 
     rows = run_suite(arguments.suite, results=arguments.output, jobs=arguments.jobs, slurm=arguments.slurm,
                      retry_failed=arguments.retry_failed, dry_run=arguments.dry_run, only=arguments.only,
-                     per_gpu=arguments.per_gpu, rows=arguments.rows, device=arguments.device)
+                     per_gpu=arguments.per_gpu, rows=arguments.rows, device=arguments.device,
+                     iterations=arguments.iterations, scenes=arguments.scenes)
     if rows:
         print(rows_table(rows))
     failed = sum(not row["ok"] for row in rows)
     if failed:
         print(f"{failed} of {len(rows)} cells failed; their rows say why, --retry-failed runs them again")
+    if rows:
+        results = arguments.output or os.path.join("bench_results", rows[0]["suite"])
+        print(f"rows: {printable(results)}; tables and curves of them: {command()} bench report {shlex.quote(results)}")
     return 1 if failed else 0
 
 
@@ -110,7 +144,10 @@ def _run(arguments: argparse.Namespace) -> None:
     from .patches.run import run
 
     words = arguments.words[1:] if arguments.words[:1] == ["--"] else arguments.words
-    run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate)
+    take_paper(arguments)
+    if not arguments.blend_mode:
+        arguments.command_parser.error("--blend-mode MODE or --paper is needed")
+    run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate, arguments.faint_below)
 
 
 def _train(arguments: argparse.Namespace) -> Optional[int]:
@@ -153,14 +190,13 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     from .results.modelfile import model_path
     from .results.rows import blend_name, results_table, viewer_warning
     from .system.device import device_line
-    from .system.process import command
     from .train import train
 
     if not group.leads:
         train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
         return
     print(device_line(config.device), flush=True)
-    blend = blend_name(config.blend_mode, config.background_gate)
+    blend = blend_name(config.blend_mode, config.background_gate, config.faint_below)
     budget = f" to {config.budget} Gaussians" if config.budget else ""
     batch = f", {config.batch} views a step" if config.batch > 1 else ""
     processes = f", in {group.size} processes" if group.size > 1 else ""
@@ -169,11 +205,16 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
+    if config.strategy == STRATEGY and not arguments.resume and "budget" not in given_options(arguments):
+        print("note: that number is chosen for the scene; --budget N makes more or fewer, and --strategy 3dgs is the "
+              "recipe of 3DGS")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
                 say=lambda text: print(text, flush=True))
     print(results_table([row]))
+    if row["psnr_train"] is not None:
+        print(f"the training views have {row['psnr_train']:.2f} dB")
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
     if viewer_warning(row):
@@ -182,15 +223,41 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     print(f"to look at it in a browser: {command()} export {shlex.quote(config.output)} -o model.html")
 
 
+def _simplify(arguments: argparse.Namespace) -> None:
+    from .results.modelfile import model_path
+    from .results.rows import results_table, viewer_warning
+    from .simplify import simplify
+    from .system.process import command, set_up_process
+
+    arguments.device = getattr(arguments, "device", "auto")
+    _choose_device(arguments)
+    set_up_process(arguments.device)
+    given = {name: value for name, value in given_options(arguments).items()
+             if name not in ("scene", "output", "budget")}
+    row = simplify(arguments.model, arguments.output, scene=arguments.scene, budget=arguments.budget,
+                   keep=arguments.keep, loses=arguments.loses, resume=arguments.resume, overwrite=arguments.overwrite,
+                   progress=not arguments.quiet, say=lambda text: print(text, flush=True), **given)
+    print(results_table([row["start"], row]))
+    if row["protocol"]["scene_kind"] == "model":
+        print("measured against renderings of the model: there are no photographs")
+    if viewer_warning(row):
+        print(viewer_warning(row))
+    path = model_path(arguments.output, row["protocol"]["iterations"])
+    print(f"model: {printable(path)}, {os.path.getsize(path) / 1e6:.1f} MB of {row['start']['bytes'] / 1e6:.1f} MB")
+    print(f"for the web: {command()} export {shlex.quote(arguments.output)} -o model.spz")
+
+
 def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     """The options of a training: those that are given, and for --resume the run's own."""
+    take_paper(arguments)
     given = given_options(arguments)
     if arguments.resume and set(given) & {"scene", "output"} == {"scene"}:  # dsmoe train --resume OUT
         given["output"] = arguments.output = given.pop("scene")
         del arguments.scene
     if not given.get("output") or not given.get("scene") and not arguments.resume:
         arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs only OUT")
-    presets = ["--fast"] * arguments.fast + ["--scale-recipe"] * arguments.scale_recipe
+    presets = [f"--{name}" for name in ("fast", "best") if getattr(arguments, name)]
+    presets += ["--scale-recipe"] * arguments.scale_recipe
     if arguments.resume and presets and "scene" not in given:
         arguments.command_parser.error(f"{presets[0]} needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")
@@ -199,9 +266,20 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
 
         earlier = TrainConfig.load(run).device if arguments.resume and holds_run(run) else None
         given["device"] = arguments.device = earlier or chosen_device()
+    if given.get("init"):
+        _start_from(arguments)
     if not arguments.resume or "scene" in given and (presets or not holds_run(run)):
         return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
+
+
+def _start_from(arguments: argparse.Namespace) -> None:
+    """--init becomes the model's file, and the blend is its own unless another one is asked for."""
+    from .starting import blend_options, find_model, read_start
+
+    arguments.init = find_model(arguments.init).path
+    for name, value in blend_options(read_start(arguments.init), given_options(arguments)).items():
+        setattr(arguments, name, value)
 
 
 def _scene(arguments: argparse.Namespace) -> None:
@@ -254,7 +332,6 @@ def _with_lpips(net: str, device: str) -> Measure:
 
 def _render(arguments: argparse.Namespace) -> None:
     from .inspection import render_images
-    from .opening import check_source
 
     _choose_device(arguments)
     overrides = _overrides(arguments)
@@ -265,9 +342,6 @@ def _render(arguments: argparse.Namespace) -> None:
     if is_folder(arguments.source):
         config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
-        check_source(arguments.source, "and --scene")
-        if not arguments.scene:
-            raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
                           background_gate=arguments.background_gate, outputs=outputs,
@@ -331,5 +405,6 @@ def _completion(arguments: argparse.Namespace) -> None:
     print(completion_script(arguments.shell))
 
 
-COMMANDS = {"train": _train, "scene": _scene, "eval": _eval, "render": _render, "export": _export, "view": _view,
-            "patch": _patch, "run": _run, "bench": _bench, "info": _info, "completion": _completion}
+COMMANDS = {"train": _train, "simplify": _simplify, "scene": _scene, "eval": _eval, "render": _render,
+            "export": _export, "view": _view, "patch": _patch, "run": _run, "bench": _bench, "info": _info,
+            "completion": _completion}

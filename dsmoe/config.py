@@ -11,11 +11,13 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 from diff_smoe_rasterization.settings import (
     BACKGROUND_GATE_VARIABLE,
     BLEND_MODES,
+    FAINT_BELOW_VARIABLE,
     GATED_MODES,
     LEARNED,
     MAX_BACKGROUND_GATE,
     resolve_background_gate,
     resolve_blend_mode,
+    resolve_faint_below,
 )
 
 from .choices import DEVICES
@@ -60,6 +62,8 @@ class GateOptions(NamedTuple):
 class TrainConfig:
     """Options of one training run; defaults are those of 3D Gaussian Splatting (the 2023 release).
 
+    The command `dsmoe train` has another default: the strategy importance (`config_arguments.py`).
+
     Raises ConfigError from `validate` with the option's name, its value and what it must be.
     """
 
@@ -75,6 +79,10 @@ class TrainConfig:
     background_gate_start: float = _varied("a learned background gate starts with this", 1.0, smoe=0.1)
     background_gate_lr: float = _varied(
         "learning rate of the logarithm of what a learned background gate has above its bound", 0.01, smoe=0.03)
+    faint_below: Optional[float] = _option(
+        None, "smoe, smoe_eq7: where near pairs have a gate sum below this, faint pairs and tails count too; 2: "
+              "everywhere, as in the program of the paper's authors (default: $DSMOE_FAINT_BELOW, else 0.25 in smoe, 2 "
+              "in smoe_eq7)")
     iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
@@ -94,11 +102,17 @@ class TrainConfig:
     init_points: int = _option(
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
-    budget: int = _option(0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed; 0: none")
+    init: str = _option(
+        "", "start from the Gaussians of a model, in place of the scene's points: a .ply, .splat, .spz or .glb, an "
+            "output folder of `dsmoe train` or a model folder of 3DGS. --blend-mode is then the model's by default",
+        metavar="MODEL")
+    budget: int = _option(
+        0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed (default: importance chooses it "
+           "for the scene)")
     strategy: Optional[str] = _option(
         None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
               "prune; importance: grow beyond the budget, remove what changes the images least, move the rest to where "
-              "the error is; mcmc: relocation and noise (default: importance with --budget, else 3dgs)",
+              "the error is; mcmc: relocation and noise (default: importance)",
         choices=STRATEGY_NAMES)
     strategy_options: str = _option("", "settings of `importance`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
@@ -141,6 +155,7 @@ class TrainConfig:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
+            self.faint_below = _training_faint(self.blend_mode, self.faint_below)
             if self.strategy is None:
                 self.strategy = "importance" if self.budget else "3dgs"
             for name, value in {**_recipe_of(self.strategy), **learned_gate_of(self.blend_mode)}.items():
@@ -167,6 +182,7 @@ class TrainConfig:
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
+        self._require("init_points", self.init_points == 0 or not self.init, "left out with --init")
         self._require("budget", self.budget >= 0, "at least 0")
         if self.strategy in ("importance", "mcmc"):
             if self.budget == 0:
@@ -176,10 +192,9 @@ class TrainConfig:
         if self.strategy == "importance":
             self.importance_options()
             self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy importance; "
-                          "--scale-recipe makes it half of --iterations")
+                          "left out it is half of --iterations")
             self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter, "
-                          f"{self.densify_until_iter}, with --strategy importance, whose removals end there; "
-                          "--scale-recipe shortens all of it")
+                          f"{self.densify_until_iter}, with --strategy importance, whose removals end there")
         self._require("strategy_options", not self.strategy_options or self.strategy == "importance",
                       f"left out with --strategy {self.strategy}: only importance has some")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
@@ -223,15 +238,16 @@ class TrainConfig:
     def changed(self, **options: Any) -> TrainConfig:
         """A validated copy with some options set.
 
-        Another blend mode brings its default gate, and its defaults of learning one in place of the old mode's. Another
-        strategy brings its defaults of the recipe in place of the old one's, and drops the old one's own options.
+        Another blend mode brings its default gate and `faint_below`, and its defaults of learning one in place of the
+        old mode's. Another strategy brings its defaults of the recipe in place of the old one's, and drops the old
+        one's own options.
         """
         return self._changed(options).validate()
 
     def _changed(self, options: Dict[str, Any]) -> TrainConfig:
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             usual = learned_gate_of(str(self.blend_mode))
-            options = {"background_gate": None, **self._unset(usual), **options}
+            options = {"background_gate": None, "faint_below": None, **self._unset(usual), **options}
         if options.get("strategy", self.strategy) != self.strategy:
             usual = _recipe_of(str(self.strategy))
             options = {**self._unset(usual), "strategy_options": "", **options}
@@ -255,7 +271,7 @@ class TrainConfig:
                          f"{self.densify_from_iter}; --scale-recipe squeezes the recipe into so few")
         if self.strategy == "importance" and 4 * self.densify_until_iter >= 3 * self.iterations:
             notes.append(f"--densify-until-iter {self.densify_until_iter} leaves no iterations to settle; below three "
-                         "quarters of --iterations it does, and --scale-recipe makes it half of them")
+                         "quarters of --iterations it does; left out it is half of them")
         return notes
 
     def shortened(self) -> TrainConfig:
@@ -268,15 +284,17 @@ class TrainConfig:
         milestones = {name: max(1, round(getattr(default, name) * share)) for name in (
             "position_lr_max_steps", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
             "opacity_reset_interval")}
+        if self.strategy == "importance":
+            milestones["densify_until_iter"] = max(2, milestones["densify_until_iter"])
         fitting = max(1, milestones["densify_until_iter"] // 10)
         milestones["densification_interval"] = min(default.densification_interval, fitting)
         return dataclasses.replace(self, **{name: value for name, value in milestones.items()
                                             if getattr(self, name) == getattr(default, name)})
 
     def save(self, folder: str) -> None:
-        """Writes OUT/config.json, with the scene's absolute path."""
-        scene = os.path.abspath(self.scene) if self.scene else ""
-        text = json.dumps({**self.record(), "scene": scene}, indent=2) + "\n"
+        """Writes OUT/config.json, with absolute paths of the scene and of the model to start from."""
+        paths = {name: os.path.abspath(path) for name, path in (("scene", self.scene), ("init", self.init)) if path}
+        text = json.dumps({**self.record(), **paths}, indent=2) + "\n"
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
 
     def record(self) -> Dict[str, Any]:
@@ -344,7 +362,7 @@ class TrainConfig:
     def differences(self, later: TrainConfig) -> List[str]:
         """Options that keep `later` from continuing this run, one text each; more iterations do not."""
         # These alter when something is written or where, never the trained Gaussians.
-        harmless = {"scene", "output", "strict", "eval_every", "checkpoint_every"}
+        harmless = {"scene", "init", "output", "strict", "eval_every", "checkpoint_every"}
         if later.iterations > self.iterations:
             harmless.add("iterations")
         if self.blend_mode != later.blend_mode:  # what follows from that needs no text of its own
@@ -404,6 +422,16 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     if (os.environ.get(BACKGROUND_GATE_VARIABLE) or LEARNED if asked is None else asked) == LEARNED:
         return LEARNED
     return float(resolve_background_gate(blend_mode, asked))
+
+
+def _training_faint(blend_mode: str, asked: Optional[float]) -> Optional[float]:
+    """The `faint_below` that a training takes and records; None: the mode's own. Raises ValueError."""
+    if blend_mode not in GATED_MODES:
+        if asked is not None:
+            raise ValueError(f"--faint-below is {asked!r}, but the blend mode is {blend_mode}; only "
+                             f"{' and '.join(GATED_MODES)} know it")
+        return None
+    return resolve_faint_below(blend_mode, asked) if asked is not None or os.environ.get(FAINT_BELOW_VARIABLE) else None
 
 
 def flags_of(option: dataclasses.Field[Any]) -> Sequence[str]:

@@ -5,18 +5,18 @@ import argparse
 import dataclasses
 from typing import Any, Callable, Dict, Optional, Sequence, Union
 
-from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES
+from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, PAPER_PROGRAM
 
 from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
 from .errors import ConfigError
-from .fast import budget_of, with_preset
+from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, with_preset
 
 # How `--help` groups the options; those that no group names are of the last one.
 GROUPS = {
     "scene": ("images", "strict", "resolution", "test_every", "principal_point", "init_points", "white_background",
               "random_background"),
-    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
-    "length, and number of Gaussians": ("iterations", "batch", "budget", "strategy", "strategy_options"),
+    "blending": ("blend_mode", "background_gate", "background_gate_bound", "faint_below", "antialiasing"),
+    "length, and number of Gaussians": ("iterations", "batch", "init", "budget", "strategy", "strategy_options"),
     "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
     "recipe": (),
 }
@@ -43,7 +43,7 @@ def _number_or_learned(text: str) -> Union[float, str]:
     return text if text == LEARNED else _typed(float, text, f"{KINDS[float]} or `{LEARNED}`")
 
 
-_TYPES = {"int": whole_number, "float": number, "str": str, "Optional[str]": str,
+_TYPES = {"int": whole_number, "float": number, "str": str, "Optional[str]": str, "Optional[float]": number,
           "Union[float, str, None]": _number_or_learned}
 
 
@@ -76,10 +76,19 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         if option.metadata.get("choices"):
             keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
         else:
-            letter = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+            letter = "N" if option.type == "int" else "X" if "float" in str(option.type) else "NAME"
             keywords["metavar"] = option.metadata.get("metavar", letter)
         group.add_argument(*flags, help=text, dest=option.name, **keywords)
     return groups
+
+
+def take_paper(arguments: argparse.Namespace) -> None:
+    """Sets the options that --paper stands for. Raises ConfigError if one is given and is another."""
+    for name, value in PAPER_PROGRAM.items() if arguments.paper else ():
+        given = getattr(arguments, name, None)
+        if given not in (None, value) and str(given) != str(value):
+            raise ConfigError(f"--{name.replace('_', '-')} is {given!r}; with --paper it is {value!r}, or left out")
+        setattr(arguments, name, value)
 
 
 def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
@@ -91,18 +100,25 @@ def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
 def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
     """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
 
-    With --scale-recipe the milestones that are not given keep their share of the iterations; --fast is a preset that
-    does so too. earlier: the run that goes on with these options.
+    With the strategy importance, the default, and with --scale-recipe the milestones that are not given keep their
+    share of the iterations. importance also chooses by the scene (`presets.py`). earlier: the run that goes on with
+    these options. Raises ConfigError, SceneError.
     """
-    given = options = given_options(arguments)
-    fast = getattr(arguments, "fast", False)
-    if fast:
-        options = with_preset(given)
+    given = given_options(arguments)
+    preset = next((name for name in PRESETS if getattr(arguments, name, False)), None)
+    options = with_preset(given, preset, given.get("device", "cpu"))
     config = TrainConfig(**options)
-    if fast or getattr(arguments, "scale_recipe", False):
+    chooses = config.strategy == STRATEGY
+    if chooses or getattr(arguments, "scale_recipe", False):
         config = dataclasses.replace(config.shortened(), **options)
-    if fast and "budget" not in given:
-        config = dataclasses.replace(config, budget=earlier.budget if earlier else budget_of(config))
+    if chooses and earlier:
+        names = {"budget", "init_points"}
+        if earlier.blend_mode == config.blend_mode:
+            names.add("background_gate_start")
+        config = dataclasses.replace(config, **{name: getattr(earlier, name) for name in names - {*given}})
+    elif chooses:
+        dataclasses.replace(config, budget=config.budget or NUMBERS[config.device].least).validate()  # before it reads
+        config = dataclasses.replace(config, **chosen_for_scene(config, given))
     if earlier:
         earlier.check_continued_by(config)
     _check_learned(config, given)

@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 from .choices import ORBIT_FRAMES, VIDEO_FPS
+from .early import check_orbit
 from .errors import TrainerError
 from .inspection import said_of_images, to_image, write_images
 from .opening import Trained
@@ -22,10 +23,7 @@ def film(trained: Trained, path: str, frames: int = ORBIT_FRAMES, fps: float = V
     path: a file that ends in .mp4, .gif or .webp, else a folder for PNGs as `render_images` takes it. outputs: further
     images in such a folder. overwrite: files that are there may be replaced. Raises TrainerError.
     """
-    if frames < 1:
-        raise TrainerError(f"--frames is {frames}; it must be at least 1")
-    if not 0 < fps <= 1000:
-        raise TrainerError(f"--fps is {fps:g}; it must be above 0 and at most 1000")
+    check_orbit(frames, fps)
     if not is_video(path):
         check_folder(path, orbit=True)
     cameras = trained.orbit.cameras(frames, trained.cameras[0])

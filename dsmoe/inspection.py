@@ -12,7 +12,7 @@ from PIL import Image
 
 from .config import CHECKPOINT_NAME, LEARNED, TrainConfig
 from .errors import TrainerError, printable
-from .results.evaluation import Measure, evaluate
+from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, model_path
 from .results.pictures import file_names
@@ -49,8 +49,8 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     layout = read_layout(config)
     scene = load_scene(config, progress, layout).to(device)
-    note, is_other = _compared(scene, config)
-    for line in filter(None, (layout.warning, note)):
+    note, is_other = compared(scene, config)
+    for line in filter(None, (layout.warning, note + f"; {RESULTS_NAME} stays" * is_other)):
         print(line)
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
@@ -64,7 +64,9 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     evaluation = evaluate(renderer, views, device, progress, measure)
     if opened.so_far:
         config, seconds = replace(config, iterations=opened.so_far.iteration), opened.so_far.seconds
-    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
+    training = evaluate(renderer, scene.train, device, progress, psnr_alone, passes=1).metrics["psnr"]
+    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, training,
+                     renderer.background_gate)
     if split == "test" and not is_other and not opened.so_far:
         try:
             write_results(output, [row])
@@ -84,7 +86,7 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
     gate = agreed_background_gate(ply, mode, recorded, asked_gate)
     return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
-                    background_gate=gate)
+                    background_gate=gate, faint_below=recorded.faint_below)
 
 
 class OpenedRun(NamedTuple):
@@ -116,12 +118,15 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
           f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
     renderer = Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
-                        rasterize, background_gate=gate)
+                        rasterize, background_gate=gate, faint_below=config.faint_below)
     return OpenedRun(renderer, so_far.path, so_far)
 
 
-def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
-    """What to say of a scene that the run's checkpoint does not record, and whether it is another one; else nothing."""
+def compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
+    """What to say of a scene that the run's checkpoint does not record, and whether it is another one; else nothing.
+
+    scene: loaded with checksums.
+    """
     path = os.path.join(config.output, CHECKPOINT_NAME)
     try:
         with damage_named(path):
@@ -131,8 +136,7 @@ def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
     difference = difference_of(scene, recorded)
     if not difference:
         return "", False
-    return (f"note: {config.scene} is not the scene that {config.output} was trained on: {difference} here; "
-            f"{RESULTS_NAME} stays"), True
+    return f"note: {config.scene} is not the scene that {config.output} was trained on: {difference} here", True
 
 
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",

@@ -1,6 +1,7 @@
 """The trainable Gaussians: raw parameters and their activations."""
 from __future__ import annotations
 
+import math
 from typing import Dict, Optional, Tuple
 
 import torch
@@ -67,6 +68,16 @@ class GaussianModel:
             "scales": log_scales.float().unsqueeze(1).repeat(1, 3),
             "rotations": rotations,
         }, sh_degree)
+
+    @classmethod
+    def from_gaussians(cls, raw: Dict[str, torch.Tensor], sh_degree: int) -> GaussianModel:
+        """Trained Gaussians, all of whose harmonics are active; sh_degree: to which they are cut or filled with 0."""
+        shs, bands = raw["shs"], (sh_degree + 1) ** 2 - 1
+        there = shs.shape[1]
+        filled = torch.cat([shs[:, :bands], shs.new_zeros(len(shs), max(0, bands - there), 3)], 1)
+        model = cls({**raw, "shs": filled}, sh_degree)
+        model.active_sh_degree = min(sh_degree, math.isqrt(there + 1) - 1)
+        return model
 
     @property
     def raw(self) -> Dict[str, torch.Tensor]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, List, Optional, Tuple
 
 from .config import TrainConfig
-from .errors import TrainerError
+from .early import check_source
 from .inspection import open_renderer, open_run
 from .model import GaussianModel
 from .results.rendering import Renderer
@@ -13,7 +13,7 @@ from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import load_cameras
 from .system.device import check_device
-from .system.files import is_file, is_folder
+from .system.files import is_folder
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
                  device: str = "cpu", **options: Any) -> Trained:
     """Opens the output folder of `dsmoe train`, before its end the checkpoint in it, or a .ply.
 
-    blend_mode, background_gate: needed for a .ply that does not record them; they must agree if something does.
+    blend_mode, background_gate: of a .ply that does not record them (else alpha); they must agree if something does.
     options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. There are none if the
     run's scene is not there. Raises TrainerError.
     """
@@ -46,13 +46,6 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
         renderer = open_renderer(config, path, blend_mode, device, asked_gate=background_gate)
     cameras, orbit = places(config, renderer.model, needed="scene" in options)
     return Trained(config, path, renderer, cameras, orbit, so_far is None)
-
-
-def check_source(source: str, besides: str = "") -> None:
-    """Raises TrainerError if there is no such folder or file. besides: what a .ply needs, for that error."""
-    if not is_folder(source) and not is_file(source):
-        raise TrainerError(f"{source}: no such file or folder; name the output folder of `dsmoe train`, or a .ply"
-                           + (f" {besides}" if besides else ""))
 
 
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:

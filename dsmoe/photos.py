@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from typing import Any, Callable, List, Optional, Sequence, Tuple
 
 from .choices import CAMERA_MODEL, MATCHING, MOST_EXHAUSTIVE
-from .errors import SceneError, TrainerError
+from .early import FROM_VIDEO, VIDEO_ENDINGS, check_photos
+from .errors import SceneError, TrainerError, printable
 from .scenes.images import UNREADABLE, image_size, open_image
-from .system.files import is_file, is_folder, write_json_atomically
+from .system.files import is_file, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.process import pip_install
 from .system.progress import progress_bar
@@ -28,7 +29,6 @@ FEATURES = "photographs.json"  # of which photographs the database has features
 WRITTEN = ("images", "sparse/0", *(f"{WORK}/{name}" for name in ("models", "best", "undistorted")))
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
-VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 MIN_PHOTOS = 3
 POLL_SECONDS = 0.5
 FOCAL_LENGTH, EXIF = 37386, 0x8769  # tags
@@ -63,7 +63,10 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
     MOST_EXHAUSTIVE. say: is called with a line before each step. Raises SceneError, also if the photographs do not
     connect, and TrainerError without pycolmap.
     """
-    names = photo_names(photos, output)
+    names = photo_names(photos, output, say)
+    for path in (photos, output, *names):
+        if any("\ud800" <= letter <= "\udfff" for letter in path):
+            raise SceneError(f"{path}: COLMAP takes only names that are UTF-8; rename it")
     try:
         import pycolmap
     except ImportError as error:
@@ -94,25 +97,13 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
                 sorted({*names} - placed), image_size(os.path.join(output, files[0])))
 
 
-def _check_folder(photos: str) -> None:
-    """Raises SceneError if it is no folder."""
-    if is_folder(photos):
-        return
-    if not is_file(photos):
-        raise SceneError(f"{photos}: no such folder of photographs")
-    if photos.lower().endswith(VIDEO_ENDINGS):
-        raise SceneError(f"{photos} is a file; of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 "
-                         "PHOTOS/%04d.jpg")
-    raise SceneError(f"{photos} is a file; name the folder of the photographs, such as "
-                     f"{os.path.dirname(photos) or '.'}")
-
-
-def photo_names(folder: str, output: str) -> List[str]:
+def photo_names(folder: str, output: str, say: Callable[[str], None] = lambda text: None) -> List[str]:
     """The photographs below a folder, by their paths in it; hidden files and the folder `output` are left out.
 
-    Raises SceneError if they are too few.
+    say: is called if a video is among them. Raises SceneError if they are too few, or one is a pipe or a device, which
+    reading would wait for.
     """
-    _check_folder(folder)
+    check_photos(folder)
     made = os.path.join(os.path.realpath(output), "")
     if os.path.join(os.path.realpath(folder), "").startswith(made):
         raise SceneError(f"{folder} lies in {output}, the folder to write; name another one with -o")
@@ -120,11 +111,19 @@ def photo_names(folder: str, output: str) -> List[str]:
                    if not os.path.join(os.path.realpath(place), "").startswith(made)
                    for name in files if not name.startswith("."))
     found = [name for name in names if name.lower().endswith(ENDINGS)]
+    strange = next((name for name in found if not is_file(os.path.join(folder, name))), None)
+    if strange:
+        raise SceneError(f"{os.path.join(folder, strange)}: is no file that can be read (a pipe, a device, or a link "
+                         "to one or to nothing); remove it")
+    video = next((name for name in names if name.lower().endswith(VIDEO_ENDINGS)), None)
+    hint = f"{video} is a video; {FROM_VIDEO}" if video else ""
+    if hint and len(found) >= MIN_PHOTOS:
+        say(printable(f"note: {hint}; it is left out"))
     if len(found) < MIN_PHOTOS:
-        other = next((name for name in names if name.lower().endswith(UNKNOWN_ENDINGS + VIDEO_ENDINGS)), None)
-        hint = f"; {other} is of a kind that COLMAP does not read: convert it to JPEG" if other else ""
+        other = next((name for name in names if name.lower().endswith(UNKNOWN_ENDINGS)), None)
+        hint = f"{other} is of a kind that COLMAP does not read: convert it to JPEG" if other else hint
         raise SceneError(f"{folder}: {len(found)} photographs ({', '.join(ENDINGS)}) are in it; at least {MIN_PHOTOS} "
-                         f"are needed{hint}")
+                         f"are needed{'; ' * bool(hint)}{hint}")
     return found
 
 

@@ -17,7 +17,8 @@ import torch
 from .config import IMAGES, TrainConfig, flags_text
 from .errors import TrainerError, in_one_line, print_any_name
 from .inspection import open_renderer, to_image
-from .quickstart_options import DEFAULT_FOLDER, MODES, config_of, given_options, parse
+from .presets import FAST, STRATEGY, chosen_for_scene, with_preset
+from .quickstart_options import DEFAULT_FOLDER, MODES, config_of, given_options, parse, unchecked_config
 from .results.metrics import psnr, quantised
 from .results.modelfile import model_path
 from .results.pictures import comparison, evenly_spaced, file_names
@@ -25,7 +26,7 @@ from .results.rows import RESULTS_NAME, blend_name, results_table, viewer_warnin
 from .scenes.images import View, image_size
 from .scenes.scene import Scene, load_scene, read_layout
 from .scenes.synthetic import write_synthetic_scene
-from .short_run import short_run
+from .short_run import smaller_images
 from .system.device import chosen_device, device_line
 from .system.interrupt import exit_status
 from .system.output_folder import Record, make_folder, only_one, own_record, read_record, remove_files, write_record
@@ -88,8 +89,10 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
         remove_files(output, files)
         rows = []
         for mode in MODES:
-            rows.append(train(config.changed(blend_mode=mode, output=os.path.join(output, mode)), overwrite=True,
-                              progress=progress, scene=scene))
+            own = config.changed(blend_mode=mode, output=os.path.join(output, mode))
+            if own.strategy == STRATEGY:
+                own = own.changed(**chosen_for_scene(own, ("init_points",)))  # what only this mode has
+            rows.append(train(own, overwrite=True, progress=progress, scene=scene))
             shutil.copyfile(model_path(os.path.join(output, mode), config.iterations),
                             os.path.join(output, mode + ".ply"))
         write_results(output, rows)
@@ -125,18 +128,28 @@ def _earlier_files(output: str, subject: str) -> List[str]:
 
 
 def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
-    """The given options, and for the others a short training (`short_run`); prints what it chose."""
+    """The given options, and for the others the preset `--fast`, with as many Gaussians in both modes.
+
+    On a CPU large images are reduced. Prints what it chose.
+    """
     layout = read_layout(TrainConfig(scene=folder, images=given.get("images", IMAGES),
                                      strict=given.get("strict", False)))
     if layout.warning:
         print(layout.warning, flush=True)
     device = given.get("device", "cpu")
-    chosen = short_run(device, *image_size(layout.train[0].path), len(layout.points.positions))
-    chosen = {name: value for name, value in chosen.items() if name not in given}
+    options: Dict[str, Any] = {"iterations": FAST[device].iterations}
+    if device == "cpu":
+        options.update(smaller_images(*image_size(layout.train[0].path)))
+    options.update(given)
+    if given.get("strategy", STRATEGY) == STRATEGY:
+        options = with_preset(options, "fast", device)
+        options.update(chosen_for_scene(unchecked_config(folder, options), given))
+    config = config_of(folder, options, given)
+    chosen = {name: value for name, value in options.items() if name not in given}
     if chosen:
         lasts = "some minutes" if device == "cpu" else "about a minute"
         print(f"chosen for a run of {lasts}: {flags_text(chosen)}", flush=True)
-    return config_of(folder, {**chosen, **given}, given)
+    return config
 
 
 def shown_views(scene: Scene) -> Dict[str, View]:

@@ -8,13 +8,14 @@ from typing import Any, Dict, List, Optional
 from .config import TrainConfig
 from .config_arguments import add_arguments
 from .errors import SceneError, TrainerError, print_any_name
+from .presets import NUMBERS, STRATEGY
 from .system.files import is_file, is_folder
 
 MODES = ("alpha", "smoe")
 DEFAULT_FOLDER = "quickstart_output"  # has a folder for each scene
 # Offered by `dsmoe train` and fixed here.
 FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "background_gate_start",
-         "background_gate_lr", "eval_every", "checkpoint_every")
+         "background_gate_lr", "init", "eval_every", "checkpoint_every")
 
 
 def parse(argv: Optional[List[str]] = None) -> argparse.Namespace:
@@ -40,13 +41,14 @@ def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
     return {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
 
 
-def config_of(folder: str, options: Dict[str, Any], given: Dict[str, Any]) -> TrainConfig:
-    """The training by these options, of which some are given. Raises ConfigError.
+def unchecked_config(folder: str, options: Dict[str, Any]) -> TrainConfig:
+    """The training by these options; milestones keep their share of the iterations."""
+    return TrainConfig(**{"scene": folder, "blend_mode": MODES[0], "checkpoint_every": 0, **options}).shortened()
 
-    The recipe's milestones keep their share of the iterations (`TrainConfig.shortened`), but for given ones.
-    """
-    base = TrainConfig(**{"scene": folder, "blend_mode": MODES[0], "checkpoint_every": 0, **options})
-    return base.shortened().changed(**given)
+
+def config_of(folder: str, options: Dict[str, Any], given: Dict[str, Any]) -> TrainConfig:
+    """The training by these options, of which some are given. Raises ConfigError."""
+    return unchecked_config(folder, options).changed(**given)
 
 
 def check(argv: Optional[List[str]] = None) -> int:
@@ -54,6 +56,8 @@ def check(argv: Optional[List[str]] = None) -> int:
     print_any_name()
     arguments = parse(argv)
     options = {name: value for name, value in given_options(arguments).items() if name != "device"}
+    if options.setdefault("strategy", STRATEGY) == STRATEGY:
+        options.setdefault("budget", NUMBERS["cpu"].least)  # a scene's number is not known yet
     try:
         config_of(arguments.scene or "", options, options)
         if arguments.scene and not is_folder(arguments.scene):

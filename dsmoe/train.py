@@ -16,7 +16,9 @@ from .results.rendering import Rasterize
 from .results.rows import RESULTS_NAME, result_row, write_results
 from .results.scalars import FOLDER as SCALARS_FOLDER
 from .results.scalars import Scalars, scalar_files
+from .scenes.modelfolder import CAMERAS, cameras_content
 from .scenes.scene import Scene, describe_scene, load_scene, read_layout
+from .starting import check_start
 from .system.device import check_device
 from .system.files import is_file, write_atomically, write_json_atomically
 from .system.group import Group
@@ -42,7 +44,8 @@ from .training.trainer import Trainer
 HISTORY_NAME = "history.json"  # the evaluations during a run
 LOSS_NAME = "loss.png"
 PER_VIEW_NAME = "per_view.json"
-PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
+# Beside config.json and the models.
+PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME, CAMERAS)
 TRAIN = "dsmoe train"  # in its folders' records
 PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
 
@@ -69,9 +72,9 @@ class Run:
         with damage_named(path):
             state = load_checkpoint(path, self.trainer.checkpoint_device)
             self.trainer.check_state(state)
-            self.trainer.load_state_dict(state)
-            self.history = list(state["history"])
-            self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
+        self.trainer.load_state_dict(state)
+        self.history = list(state["history"])
+        self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
@@ -124,13 +127,17 @@ class Run:
         trainer, config = self.trainer, self.trainer.config
         gate, model = trainer.background_gate, trainer.whole_model()
         if trainer.leads:
-            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate)
+            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate,
+                       config.faint_below)
         evaluation = trainer.evaluate(self.progress)
-        row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation, gate)
+        row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation,
+                         trainer.evaluate_training_views(self.progress), gate)
         if not trainer.leads:
             return row
         write_results(os.path.dirname(self._path(RESULTS_NAME)), [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
+        views = [*trainer.scene.test, *trainer.scene.train]
+        write_json_atomically(self._path(CAMERAS), cameras_content([view.camera for view in views]))
         if self.losses:
             write_atomically(self._path(LOSS_NAME), lambda file: loss_plot(self.losses).save(file, "PNG"))
         return row
@@ -278,6 +285,11 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         return run.train()
     earlier_files(config, resume, overwrite)
     layout = None if scene else read_layout(config)
+    if config.init and layout and not resume:  # a model of another scene is told before a folder is made
+        scene = load_scene(config, progress, layout)
+        quality = check_start(scene, config)
+        if say:
+            say(f"{config.init}: {quality.text(config)}")
     make_folder(config.output)  # a folder that cannot be made is told before images are read
     with only_one(config.output) as lock:
         earlier = earlier_files(config, resume, overwrite)  # again: another run may have been at work there

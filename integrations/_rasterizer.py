@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 import diff_smoe_rasterization
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
+from diff_smoe_rasterization.checks import check_tensor
 from diff_smoe_rasterization.learned_gate import gate_of
 from diff_smoe_rasterization.rasterizer import visible_radii
 from diff_smoe_rasterization.settings import GateMap, resolve_blend
@@ -22,6 +23,40 @@ ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), 
 # Results that need another walk, by `contributions` or `gate_map`.
 COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums")
 MAPPED = ("largest", "median_depth")
+# Of arguments that are read before `rasterize` looks at them; others have N rows.
+AXES = {"means3D": ("N", 3), "means2D": ("N", "D"), "means2D_densify": ("N", 3), "dc": ("N", 1, 3),
+        "shs": ("N", "K", 3), "colors_precomp": ("N", "C"), "theta": (3,), "rho": (3,)}
+
+
+def given_inputs(settings: Settings, inputs: Dict[str, Any]) -> Dict[str, Any]:
+    """Returns the inputs with None for what is absent.
+
+    Raises TypeError or ValueError, as `rasterize` does, for what this module would compute with before `rasterize`
+    looks at it.
+    """
+    means, checked = inputs["means3D"], {}
+    check_tensor("rasterize", "means3D", means)
+    check_tensor("rasterize", "bg", settings.bg)
+    _check_axes("bg", settings.bg, ("C",))
+    for name, value in inputs.items():
+        if value is not None:
+            check_tensor("rasterize", name, value)
+            if value.numel() == 0 and (means.numel() > 0 or value.dim() == 1):
+                value = None
+            else:
+                axes = AXES.get(name, ("N", *value.shape[1:]))
+                flat = value.reshape(-1) if axes == (3,) else value
+                _check_axes(name, flat, (len(means), *axes[1:]) if axes[0] == "N" and name != "means3D" else axes)
+        checked[name] = value
+    return checked
+
+
+def _check_axes(name: str, tensor: torch.Tensor, axes: Sequence[Any]) -> None:
+    """Raises ValueError unless the sizes are those of the axes; a letter is any size."""
+    if tensor.dim() != len(axes) or any(size != axis and not isinstance(axis, str)
+                                        for size, axis in zip(tensor.shape, axes)):
+        raise ValueError(f"rasterize: {name} has shape {list(tensor.shape)}; it must be "
+                         f"[{', '.join(map(str, axes))}]")
 
 
 def pixel_rays(settings: Settings, like: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
@@ -147,7 +182,8 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
         settings = settings._replace(low_pass=own["kernel_size"], antialiasing=True)
     points = inputs.get("means2D")
     if own.get("depth_threshold") and points is not None:
-        depths = (inputs["means3D"] @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]).detach()
+        view = settings.viewmatrix.to(inputs["means3D"])
+        depths = (inputs["means3D"] @ view[:3, 2] + view[3, 2]).detach()
         factors = (depths / own["depth_threshold"]).square().clamp(max=1)
         inputs.update({name: scaled_gradient(factors, inputs[name]) for name in ("means2D", "means2D_abs")
                        if name in inputs})
@@ -247,6 +283,7 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
     returns = ", ".join(f"{name} {RESULTS[name][0]}" for name in entry.results)
 
     def render(settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
+        inputs = given_inputs(settings, inputs)
         densify = inputs.pop("means2D_densify", None)
         if densify is not None:  # one gradient of the image, which both receive
             inputs["means2D"] = densify if inputs["means2D"] is None else inputs["means2D"] + densify

@@ -52,6 +52,8 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
     do.
     """
     required, _ = tensor_checks("rasterize_gaussians_indexed", "means3D", means3D)
+    if means3D.dim() != 2:
+        raise ValueError(f"rasterize_gaussians_indexed: means3D has shape {list(means3D.shape)}; it must be [N, 3]")
     count = len(means3D)
 
     def rows(name, codebook, index_name, indices):

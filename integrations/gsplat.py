@@ -3,11 +3,13 @@ from __future__ import annotations
 
 from typing import Any, Dict, Optional, Tuple
 
+import numpy as np
 import torch
 import torch.nn.functional as functional
 
 from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, reference, visible_radii
 from diff_smoe_rasterization.camera import clip_matrix
+from diff_smoe_rasterization.checks import checked_number
 from diff_smoe_rasterization.gaussians import divided
 from diff_smoe_rasterization.settings import BackgroundGate
 
@@ -84,6 +86,11 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
     _refuse_what_is_not_offered(
         others, sparse_grad=(sparse_grad, False), distributed=(distributed, False),
         camera_model=(camera_model, "pinhole"))
+    for name, size in (("width", width), ("height", height)):
+        if not isinstance(size, (int, np.integer)) or size < 1:
+            raise ValueError(f"rasterization: {name} is {size!r}; it must be a whole number of pixels, 1 or more")
+    far_plane, radius_clip = checked_number("rasterization", "far_plane", far_plane), checked_number(
+        "rasterization", "radius_clip", radius_clip)
     _check_choice("render_mode", render_mode, RENDER_MODES)
     _check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
     _check_shape("means", means, (-1, 3))
@@ -91,6 +98,8 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
     count, num_cameras = len(means), len(viewmats)
     if num_cameras == 0:
         raise ValueError("rasterization: viewmats has shape [0, 4, 4]; there must be a camera")
+    if viewmats.dtype != means.dtype:
+        raise TypeError(f"rasterization: viewmats is {viewmats.dtype}; it must be {means.dtype}, as means is")
     _check_shape("Ks", Ks, (num_cameras, 3, 3))
     _check_shape("opacities", opacities, (count,))
     with_color, with_depth = "RGB" in render_mode, "D" in render_mode

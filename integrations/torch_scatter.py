@@ -5,6 +5,8 @@ from typing import Optional, Tuple
 
 import torch
 
+from diff_smoe_rasterization.checks import check_tensors
+
 __all__ = ["scatter", "scatter_max"]
 
 
@@ -12,8 +14,9 @@ def scatter(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Optional
             dim_size: Optional[int] = None, reduce: str = "sum") -> torch.Tensor:
     """Sums the elements of `src` that have the same index along `dim`.
 
-    src: any shape. index: int64, of the shape of `src` or, in one dimension, of the size of its `dim`. dim_size: the
-    size of the result along `dim`; None: the largest index + 1. Has a gradient by `src`.
+    src: any shape. index: int64, of one axis, that of `dim`, or of the first axes of `src`; axes of size 1 and those
+    that are missing are expanded. dim_size: the size of the result along `dim`; None: the largest index + 1. Has a
+    gradient by `src`.
     Raises NotImplementedError for what the trainers do not use: `out`, and another reduction than "sum" or "add".
     """
     if out is not None or reduce not in ("sum", "add"):
@@ -49,13 +52,18 @@ def scatter_max(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Opti
 
 
 def _fitted(function, src, index, dim, dim_size):
-    """Returns the index in the shape of `src`, and the shape of the result."""
-    if index.dim() == 1 and src.dim() > 1:
-        along = [1] * src.dim()
-        along[dim] = -1
-        index = index.reshape(along)
-    if index.dim() != src.dim():
+    """Returns the index in the shape of `src`, and the shape of the result. Raises TypeError or ValueError."""
+    check_tensors(function, src=src, index=index)
+    if index.dtype != torch.int64:
+        raise TypeError(f"{function}: index is {index.dtype}; it must be torch.int64")
+    if not -src.dim() <= dim < src.dim():
+        raise ValueError(f"{function}: dim is {dim}; src has {src.dim()} axes")
+    before = dim % src.dim() if index.dim() == 1 else 0
+    behind = src.dim() - index.dim() - before
+    # What is missing counts as 1: behind the axes of the index, and around a single one.
+    axes = [1] * before + list(index.shape) + [1] * behind
+    if behind < 0 or any(size not in (1, wanted) for size, wanted in zip(axes, src.shape)):
         raise ValueError(f"{function}: index has shape {list(index.shape)}; it must fit src, {list(src.shape)}")
-    index, shape = index.expand_as(src), list(src.shape)
+    index, shape = index.reshape(axes).expand_as(src), list(src.shape)
     shape[dim] = dim_size if dim_size is not None else (int(index.max()) + 1 if index.numel() else 0)
     return index, shape

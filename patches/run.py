@@ -17,7 +17,13 @@ from pathlib import Path
 from typing import Dict, List, NoReturn, Optional, Sequence, Set, Tuple, Union
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
-from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
+from diff_smoe_rasterization.settings import (
+    BACKGROUND_GATE_VARIABLE,
+    BLEND_MODE_VARIABLE,
+    FAINT_BELOW_VARIABLE,
+    resolve_faint_below,
+    training_background_gate,
+)
 from dsmoe.system.children import die_with_parent
 
 from . import facts, kernels
@@ -33,13 +39,13 @@ FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
-        background_gate: Union[float, str, None] = None) -> NoReturn:
+        background_gate: Union[float, str, None] = None, faint_below: Optional[float] = None) -> NoReturn:
     """Runs the command, and ends with its exit status, or 128 + N if signal N ended it.
 
     If this process is killed, the command gets a SIGTERM. Raises PatchError if the command would not run, or did
     not, with this rasterizer.
     """
-    environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
+    environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate, faint_below)
     _check_python(words[0], environment)
     for line in lines:
         print("dsmoe run: " + line, file=sys.stderr)
@@ -64,11 +70,12 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
 
 
 def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
-            environment: Dict[str, str], background_gate: Union[float, str, None] = None
-            ) -> Tuple[Dict[str, str], List[str]]:
+            environment: Dict[str, str], background_gate: Union[float, str, None] = None,
+            faint_below: Optional[float] = None) -> Tuple[Dict[str, str], List[str]]:
     """Returns the environment of the command, and what the user is told about it."""
     try:
         gate = training_background_gate(blend_mode, background_gate)
+        faint = None if faint_below is None else resolve_faint_below(blend_mode, faint_below)
     except ValueError as error:
         raise PatchError(str(error)) from None
     if not words:
@@ -87,6 +94,8 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
                    "PYTHONDONTWRITEBYTECODE": "1",  # no __pycache__ in the checkout
                    PACKAGES: os.pathsep.join([*(f"{name}={one}" for name, one in flavours.items()),
                                               *(f"{name}=" for name in blocked)])}
+    if faint is not None:
+        environment[FAINT_BELOW_VARIABLE] = str(faint)
     environment.setdefault("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # torch.load of checkpoints, which are tuples
     warnings += facts.of_one_name(folders[0])
     if (named == "inria_2024" or "," in named) and not _may_use_sparse_adam(words, files, found):
@@ -102,6 +111,7 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     will_be = ", ".join(f"{', '.join(name for name in shown if shown[name] == one)} will be {one}"
                         for one in dict.fromkeys(shown.values()))
     blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
+    blend += "" if faint is None else f", faint_below {faint:g}"
     return environment, [f"{where}: {will_be} of this package, blend mode {blend}; each process that "
                          "imports it says so", *(f"warning: {warning}" for warning in warnings)]
 

@@ -9,7 +9,6 @@ import os
 import re
 import sys
 import types
-import warnings
 from pathlib import Path
 from typing import Any, Callable, Dict, Tuple
 
@@ -18,14 +17,17 @@ from diff_smoe_rasterization.settings import (
     BACKGROUND_GATE_VARIABLE,
     BLEND_MODE_VARIABLE,
     BLEND_MODES,
+    FAINT_BELOW_VARIABLE,
     GATED_MODES,
     LEARNED,
+    PAPER,
+    PAPER_PROGRAM,
     resolve_blend_mode,
+    resolve_faint_below,
 )
 
 STAND_INS = Path(__file__).resolve().parent / "stand_ins"
-OPTIONS = ("blend_mode", "background_gate")
-FAINT_EVERYWHERE = 2.0  # no gate sum is above 1
+OPTIONS = ("blend_mode", "background_gate", "faint_below")  # as cfg_args records them; the last one is no flag
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
@@ -61,7 +63,7 @@ def smoe_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
     In `smoe` tails count in every pixel, as in their program. A model without a recorded mode is of that program.
     """
     blend = blend_of(dataset, of_saved, unrecorded="smoe")
-    return {**blend, "faint_below": FAINT_EVERYWHERE} if blend["blend_mode"] == "smoe" else blend
+    return {**blend, "faint_below": settings.EVERYWHERE} if blend["blend_mode"] == "smoe" else blend
 
 
 def saved_smoe_of(dataset: Any) -> Dict[str, Any]:
@@ -88,11 +90,13 @@ def _take_saved(dataset: Any) -> None:
 
 
 def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") -> Dict[str, Any]:
-    """Returns the settings `blend_mode` and `background_gate` of a run (None but in GATED_MODES).
+    """Returns the settings `blend_mode`, `background_gate` and `faint_below` of a run (None but in GATED_MODES).
+
+    The blend mode PAPER stands for PAPER_PROGRAM. $DSMOE_FAINT_BELOW is recorded too.
 
     A gate that is learned begins anew; under `of_saved` it is that of the model's file, and is never stepped.
 
-    Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args.
+    Notes them in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args.
     Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a
     `background_gate`: 0.
     From then on a rendering of this process whose settings name no mode has both.
@@ -100,7 +104,11 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
     Raises ValueError if one is wrong, RuntimeError if the renderer has another rasterizer.
     """
     _check_renderer()
-    mode, gate = (getattr(dataset, option, None) for option in OPTIONS)  # a gate that is typed is a string
+    mode, gate, faint = (getattr(dataset, option, None) for option in OPTIONS)  # a gate that is typed is a string
+    if mode == PAPER:
+        if gate not in ("", None) and gate != "0" and gate != 0:
+            raise ValueError(f"the background gate is {gate!r}; with the blend mode {PAPER} it is 0, or left out")
+        mode, gate, faint = PAPER_PROGRAM.values()
     saved = _saved(dataset)
     if not mode and unrecorded == "smoe":
         say("this model's cfg_args records no blend mode, so it is smoe with the gate 0, as the program of the paper's "
@@ -111,7 +119,7 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
               "the patch); --blend_mode says otherwise")
         mode = unrecorded
     if mode not in BLEND_MODES:
-        raise ValueError(f"the blend mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)}")
+        raise ValueError(f"the blend mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)} or {PAPER}")
     if mode in GATED_MODES and gate is None:
         _warn("this model's cfg_args records no background gate, so it is 0 (a model trained by `dsmoe run`, "
               "or in another mode); --background_gate says otherwise")
@@ -122,19 +130,26 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
     if unrecorded == "smoe" and asked is None and mode in GATED_MODES:
         asked = os.environ.get(BACKGROUND_GATE_VARIABLE) or 0.0
     gate = settings.training_background_gate(mode, asked)
+    if faint is None and os.environ.get(FAINT_BELOW_VARIABLE):
+        faint = resolve_faint_below(mode, None)
+    faint = faint if mode in GATED_MODES else None
     keep_records()
     if gate == LEARNED:
         _begin_gate(frozen=of_saved)
-    say(f"blend mode {mode}" + (f", background gate {gate}" if gate is not None else ""))
+    say(f"blend mode {mode}" + (f", background gate {gate}" if gate is not None else "")
+        + (f", faint_below {faint:g}" if faint is not None else ""))
     # Rendering without an option never warns: it has what cfg_args records.
-    for option, value in zip(OPTIONS, (mode, gate)):
+    for option, value in zip(OPTIONS, (mode, gate, faint)):
         before = saved.get(option)
         if value is not None and before not in (None, value):
             _warn(f"{dataset.model_path}/cfg_args is of a run with {option} {before}, but this one has {value}; a "
                   f"training overwrites it. To go on as before, give --{option} {before}")
-    settings.blend_of_process = mode, gate  # the patch's line in the renderer may be deleted
+    settings.blend_of_process = mode, gate, faint  # the patch's line in the renderer may be deleted
     dataset.blend_mode, dataset.background_gate = mode, gate
-    return {"blend_mode": mode, "background_gate": gate}
+    if faint is None:
+        return {"blend_mode": mode, "background_gate": gate}
+    dataset.faint_below = faint
+    return {"blend_mode": mode, "background_gate": gate, "faint_below": faint}
 
 
 def chosen_blend(pipe: Any) -> Dict[str, Any]:
@@ -277,7 +292,7 @@ def _saved(dataset: Any) -> Dict[str, Any]:
     """Returns what a model's cfg_args, a Namespace as text, records of the options."""
     path = Path(getattr(dataset, "model_path", "") or os.devnull, "cfg_args")
     text = path.read_text(errors="replace") if path.is_file() else ""
-    found = re.findall(r"(?:\(|, )(blend_mode|background_gate)=('\w+'|None|[\d.e+-]+)", text)
+    found = re.findall(rf"(?:\(|, )({'|'.join(OPTIONS)})=('\w+'|None|[\d.e+-]+)", text)
     return {name: ast.literal_eval(value) for name, value in found}
 
 
@@ -286,6 +301,6 @@ def say(text: str) -> None:
     print("diff_smoe_rasterization: " + text, file=sys.stderr, flush=True)
 
 
-@functools.lru_cache(maxsize=None)
 def _warn(text: str) -> None:
-    warnings.warn("diff_smoe_rasterization: " + text, stacklevel=3)
+    """By no `warnings`: trainers such as Scaffold-GS switch these off."""
+    say("warning: " + text)

@@ -90,13 +90,14 @@ std::vector<std::string> blend_names() {
 BlendRules<double> choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
                                 std::optional<double> background_gate) {
   const bool is_splat = file_extension(file) == ".splat";  // which viewers blend by alpha
-  const std::string record = is_splat ? "alpha" : model.blend_mode;
-  const std::optional<BlendMode> recorded = blend_mode_of(record);
+  std::string record = is_splat ? "alpha" : model.blend_mode;
   if (mode.empty() && record.empty()) {
-    throw UsageError(file +
-                     " does not say which blend it was trained with (no `comment blend_mode`); pass --blend, "
-                     "which is alpha for files of other 3DGS programs");
+    std::fprintf(stderr,
+                 "note: %s records no blend, so it is alpha, as other 3DGS programs blend; --blend says otherwise\n",
+                 file.c_str());
+    record = "alpha";
   }
+  const std::optional<BlendMode> recorded = blend_mode_of(record);
   const std::optional<BlendMode> chosen = mode.empty() ? recorded : blend_mode_of(mode);
   if (!chosen) {
     throw io::FormatError(file + ": records the blend mode " + io::printable(record) + ", which is none of ours");

@@ -33,7 +33,7 @@ io::GaussianModel read_model(const std::string& path);
 std::vector<std::string> blend_names();
 
 /// The blend that a file records, or the one that is asked for (empty, nullopt: nothing is). Notes go to stderr if
-/// they disagree, and if a file has an older name. Throws UsageError if neither says.
+/// they disagree. Throws UsageError if neither says.
 BlendRules<double> choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
                                 std::optional<double> background_gate);
 

@@ -38,8 +38,9 @@ def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
     method, scene = cell["method"], cell["scene"]
     return {"cell": cell["id"], "suite": cell["suite"], "method": method["name"], "label": method["label"],
             "variant": method["variant"], "scene": scene["name"], "dataset": scene["dataset"],
-            **{axis: cell[axis] for axis in AXES}, "iterations": cell["protocol"]["iterations"],
-            "end": method.get("end"), "budget": cell.get("budget", method.get("budget"))}
+            **{axis: cell[axis] for axis in AXES}, "faint_below": cell.get("faint_below"),
+            "iterations": cell["protocol"]["iterations"], "end": method.get("end"),
+            "budget": cell.get("budget", method.get("budget"))}
 
 
 def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float]) -> Dict[str, Any]:

@@ -24,7 +24,7 @@ from ..system.output_folder import (
 from . import require
 from .cell import identity
 from .errors import BenchError
-from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
+from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse, said_of
 from .names import (
     CELL_NAME,
     CELLS_FOLDER,
@@ -37,7 +37,7 @@ from .names import (
     blend_of,
     check_weights,
 )
-from .preparation import made_scene, prepared_method, what_is_missing
+from .preparation import made_scene, prepared_method, what_is_missing, without_absent_checkouts
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object, read_rows
 
@@ -48,14 +48,16 @@ SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile"
 def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = None,
               slurm: Optional[Sequence[str]] = None, retry_failed: bool = False, dry_run: bool = False,
               only: Sequence[str] = (), per_gpu: int = 1, rows: Optional[str] = None,
-              device: Optional[str] = None) -> List[Row]:
+              device: Optional[str] = None, iterations: Optional[int] = None,
+              scenes: Optional[str] = None) -> List[Row]:
     """Runs what is not done of a suite; returns the rows of its cells, failed ones included.
 
     name: a file or a shipped suite. results: by default bench_results/NAME. The others are the options of `dsmoe bench
     run`; slurm: None, or Snakemake's default resources. Raises BenchError. If nothing is to be done, neither a GPU
     nor Snakemake is needed.
     """
-    suite = load_suite(find_suite(name), device)
+    methods = [text.partition("=")[2] for text in only if text.startswith("method=")]
+    suite = load_suite(find_suite(name), device, iterations, scenes, methods)
     check_sharing(suite, jobs, slurm, per_gpu)
     check_weights(suite.protocol["lpips"])
     cells = chosen(suite.cells, only)
@@ -71,10 +73,12 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     if rows:
         print(f"{sum(row is earlier.get(name) for name, row in done.items())} of {len(cells)} cells taken from {rows}")
     to_do = [cell for cell in cells if cell["id"] not in done]
+    cells, to_do, left_out = without_absent_checkouts(cells, to_do)
     absent = what_is_missing(to_do)
     if dry_run:
-        print(plan(cells, done, absent))
+        print(plan(cells, done, [*left_out, *absent]))
         return []
+    print(*left_out, sep="\n", end="\n" * bool(left_out))
     if absent:
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
@@ -126,8 +130,7 @@ def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, A
 
 
 def _said(cell: Dict[str, Any], field: str) -> Any:
-    return {"method": cell["method"]["label"], "scene": cell["scene"]["name"],
-            "budget": cell.get("budget", 0)}.get(field, cell.get(field))
+    return {"method": cell["method"]["label"], "scene": cell["scene"]["name"]}.get(field, said_of(cell, field))
 
 
 def _same(value: Any, text: str) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import yaml
 
-from diff_smoe_rasterization.settings import GATED_MODES, resolve_background_gate
+from diff_smoe_rasterization.settings import GATED_MODES, PAPER, PAPER_PROGRAM, resolve_background_gate
 
 from ..config import LEARNED
 from ..errors import ConfigError
@@ -26,9 +26,12 @@ from .names import (
     NEEDS,
     OF_NATIVE_ALONE,
     RECIPE,
+    SCENES,
     SHIPPED,
+    UNSAID,
     WITHOUT_STRATEGY,
     blend_of,
+    is_paper,
 )
 from .protocol import config_of
 
@@ -55,19 +58,28 @@ def find_suite(name: str) -> str:
     return name if is_file else SHIPPED[name]
 
 
-def load_suite(path: str, device: Optional[str] = None) -> Suite:
-    """device: in place of the suite's protocol.device. Raises BenchError."""
-    content = read_yaml(path)
+def load_suite(path: str, device: Optional[str] = None, iterations: Optional[int] = None,
+               scenes: Optional[str] = None, methods: Sequence[str] = ()) -> Suite:
+    """As `expand`, of a file. scenes: a file of scenes in place of the suite's, or the name of one that is shipped."""
+    content, folder = read_yaml(path), os.path.dirname(os.path.abspath(path))
+    if scenes is not None and isinstance(content, dict):
+        found = scenes if os.path.isfile(scenes) else SCENES.get(scenes)
+        refuse(found is None, f"--scenes {scenes}: no such file, and no scenes that are shipped "
+                              f"({', '.join(sorted(SCENES))})")
+        content = {**content, "scenes": os.path.abspath(str(found))}
     try:
-        return expand(content, os.path.dirname(os.path.abspath(path)), device)
+        return expand(content, folder, device, iterations, methods)
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from error
 
 
-def expand(content: Any, folder: str, device: Optional[str] = None) -> Suite:
+def expand(content: Any, folder: str, device: Optional[str] = None, iterations: Optional[int] = None,
+           methods: Sequence[str] = ()) -> Suite:
     """A suite from what its file says; relative paths are taken from `folder`. Raises BenchError.
 
-    device: in place of protocol.device; `auto` becomes the device of this machine.
+    device: in place of protocol.device; `auto` becomes the device of this machine. iterations: in place of
+    protocol.iterations, with the recipe squeezed into them. methods: the labels of the only ones that are wanted; the
+    others need not be able to follow the protocol.
     """
     if isinstance(content, dict) and isinstance(content.get("scenes"), str):
         path = os.path.join(folder, content["scenes"])
@@ -78,14 +90,19 @@ def expand(content: Any, folder: str, device: Optional[str] = None) -> Suite:
     protocol = {**schema.defaults(schema.Protocol), **(content["protocol"] or {})}
     protocol = {name: value for name, value in protocol.items() if value is not None}
     protocol["device"] = device or protocol["device"]
+    if iterations is not None:
+        protocol.update(iterations=iterations, scale_recipe=True)
     if protocol["device"] == "auto":
         from ..system.device import chosen_device  # it loads torch, which a suite does without
 
         protocol["device"] = chosen_device()
     scenes = [_scene(scene, f"scenes[{index}]", protocol, folder) for index, scene in enumerate(content["scenes"])]
-    methods = [_method(method, f"methods[{index}]", protocol, folder)
-               for index, method in enumerate(content["methods"])]
-    for field, key, items in (("scenes", "name", scenes), ("methods", "label", methods)):
+    wanted = [(index, method) for index, method in enumerate(content["methods"])
+              if not methods or label_of(method).lower() in map(str.lower, methods)]
+    refuse(not wanted, f"--only method={' '.join(methods)}: the suite has "
+                       f"{', '.join(map(label_of, content['methods']))}")
+    trained = [_method(method, f"methods[{index}]", protocol, folder) for index, method in wanted]
+    for field, key, items in (("scenes", "name", scenes), ("methods", "label", trained)):
         names = [item[key] for item in items]
         for index, name in enumerate(names):
             refuse(name in names[:index], f"{field}[{index}].{key}: {name!r} is there already")
@@ -95,7 +112,7 @@ def expand(content: Any, folder: str, device: Optional[str] = None) -> Suite:
            f"scenes: {''.join(supplied[-1:])} takes images as they were reduced by others, {''.join(resized[-1:])} is "
            "reduced by the loader: two downscalers in one suite, whose figures do not compare")
     cells: List[Values] = []
-    for scene, method in itertools.product(scenes, methods):
+    for scene, method in itertools.product(scenes, trained):
         axes = {axis: {**content, **scene["axes"], **method["axes"]}[axis] for axis in AXIS_OF}
         if method["name"] != NATIVE:
             _can_train(scene, method, axes)
@@ -106,7 +123,7 @@ def expand(content: Any, folder: str, device: Optional[str] = None) -> Suite:
             config_of(cell)
         except (ConfigError, TypeError) as error:
             raise BenchError(f"cell {cell['id']}: {error}") from error
-    return Suite(content["name"], protocol, scenes, methods, cells)
+    return Suite(content["name"], protocol, scenes, trained, cells)
 
 
 def refuse(wrong: Any, words: str) -> None:
@@ -152,6 +169,14 @@ def _apart(part: Values) -> Tuple[Values, Axes]:
             {axis: part[axis] for axis in AXIS_OF if axis in part})
 
 
+def label_of(method: Values) -> str:
+    """What rows call a method of a suite file."""
+    usual = "patched" if CHECKOUTS.get(method["name"]) else "unpatched"
+    variant = method.get("variant", usual)
+    plain = method["name"] == NATIVE or variant == "patched"
+    return str(method.get("label", method["name"] if plain else f"{method['name']}-{variant}"))
+
+
 def _method(method: Values, where: str, protocol: Values, folder: str) -> Values:
     """The method with its defaults, and under `axes` the axes that it has values of its own for."""
     name = method["name"]
@@ -164,7 +189,7 @@ def _method(method: Values, where: str, protocol: Values, folder: str) -> Values
                  if key in given and (key, given[key]) != ("variant", NATIVE)]
         refuse(wrong, f"{where}.{''.join(wrong[:1])}: is for checkouts; the native trainer's recipe stands in "
                       "protocol.options")
-        return {"label": NATIVE, "variant": "native", **given, "axes": axes}
+        return {"label": label_of(method), "variant": "native", **given, "axes": axes}
     refuse("path" not in given, f"{where}.path: is missing; it names the checkout's folder")
     refuse((name == "c3dgs") != ("base" in given),
            f"{where}.base: c3dgs, and nothing else, needs it: a 3DGS checkout that trains what it compresses")
@@ -198,7 +223,7 @@ def _method(method: Values, where: str, protocol: Values, folder: str) -> Values
     _can_follow(protocol, name, where)
     python = os.path.expanduser(os.path.expandvars(given["python"])) if "python" in given else None
     given.setdefault("pythonpath", [])
-    return {"label": name if variant == "patched" else f"{name}-{variant}", **given,
+    return {"label": label_of(method), **given,
             **_paths(given, ("path", "base", "pythonpath"), where, folder),
             "python": python, "arguments": arguments, "axes": axes}
 
@@ -262,31 +287,38 @@ def _cells(content: Values, protocol: Values, scene: Values, method: Values, axe
              for name, part in (("method", method), ("scene", scene))}
 
     def cell(values: Values) -> Values:
-        if not values["budget"]:  # cells without one are named as they were before there were budgets
-            values = {name: value for name, value in values.items() if name != "budget"}
+        values = {name: value for name, value in values.items() if name not in UNSAID or value != UNSAID[name]}
         made = {"suite": content["name"], **plain, **values, "protocol": protocol, "images": content["images"],
                 "keep_models": content["keep_models"], "headline": wanted is not None and all(
-                    values.get(AXIS_OF[axis], 0) in (*chosen, None) for axis, chosen in wanted.items())}
+                    said_of(values, AXIS_OF[axis]) in (*chosen, None) for axis, chosen in wanted.items())}
         return {"id": cell_id(made), **made}
 
     first, *_ = seeds = axes["seeds"]
     combined = dict.fromkeys(itertools.starmap(_gated, itertools.product(*axes.values())))
     made = [cell(dict(zip(AXIS_OF.values(), chosen))) for chosen in combined]
-    return made + [cell({**{name: one.get(name, 0) for name in AXIS_OF.values()}, "seed": seed})
+    return made + [cell({**{name: one.get(name, UNSAID.get(name)) for name in AXIS_OF.values()}, "seed": seed})
                    for one in made if one["headline"] and one["seed"] == first
                    for seed in content["headline_seeds"] if seed not in seeds]
 
 
-def _gated(blend_mode: str, gate: Any, *rest: Any) -> Tuple[Any, ...]:
-    """A combination of the axes with the gate that is its mode's: those of the axis are only for GATED_MODES."""
+def said_of(cell: Values, field: str) -> Any:
+    """What a cell has of a field, by the word that a suite has for it."""
+    return PAPER if field == "blend_mode" and is_paper(cell) else cell.get(field, UNSAID.get(field))
+
+
+def _gated(blend_mode: str, gate: Any, faint: Optional[float], *rest: Any) -> Tuple[Any, ...]:
+    """A combination of the axes with what is its mode's: gates and faint_belows are only for GATED_MODES."""
+    if blend_mode == PAPER:
+        return (*PAPER_PROGRAM.values(), *rest)
+    faint = faint if blend_mode in GATED_MODES else None
     own = gate if blend_mode in GATED_MODES else resolve_background_gate(blend_mode, None)
-    return (blend_mode, own if own == LEARNED else float(own), *rest)
+    return (blend_mode, own if own == LEARNED else float(own), faint, *rest)
 
 
 def cell_id(cell: Values) -> str:
     """A readable name, and a checksum of everything that decides the figures: another protocol is another cell."""
     blend = blend_of(cell)
-    named = ("strategy", "densify_grad_threshold", "budget", "seed", "protocol")
+    named = ("faint_below", "strategy", "densify_grad_threshold", "budget", "seed", "protocol")
     identity = {**{key: cell[key] for key in named if key in cell}, "blend_mode": blend}
     for key in ("method", "scene"):
         identity[key] = {name: value for name, value in cell[key].items() if name not in NOT_IN_THE_IDENTITY}

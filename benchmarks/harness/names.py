@@ -6,23 +6,25 @@ import os
 from pathlib import Path
 from typing import Any, Mapping, Sequence, Union
 
-from diff_smoe_rasterization.settings import GATED_MODES
+from diff_smoe_rasterization.settings import EVERYWHERE, GATED_MODES, PAPER, PAPER_PROGRAM
 
 from ..config import RECIPE as TRAINER_RECIPE
 from .errors import BenchError
 
 SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}  # suites, by name
+SCENES = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("scenes/*.yaml")}
 # The axes of a suite (schema.py), and what a cell calls its value.
-AXIS_OF = {"blend_modes": "blend_mode", "background_gates": "background_gate",
+AXIS_OF = {"blend_modes": "blend_mode", "background_gates": "background_gate", "faint_belows": "faint_below",
            "densify_grad_thresholds": "densify_grad_threshold", "strategies": "strategy", "budgets": "budget",
            "seeds": "seed"}
+UNSAID = {"faint_below": None, "budget": 0}  # what cells without such a field have; their names are older than it
 SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")  # fields by which `--only` chooses cells
 NATIVE = "native"
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
 VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
 # Of each public trainer, whether it can be patched to this package's rasterizer (patches).
-CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
-             "2dgs": False, "dbs": False}
+CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "compact-3dgs": True, "hac": True,
+             "hac-plus": True, "2dgs": False, "dbs": False}
 WITHOUT_STRATEGY = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
 COUNTED_BY = {"taming": "--budget", "dbs": "--cap_max"}  # they are given a number of primitives, and have no threshold
 NEEDS = {"dbs": "--cap_max"}  # an argument without which a method has no size
@@ -31,7 +33,7 @@ OF_NATIVE_ALONE = ("strategy_options",)
 OF_3DGS_ALONE = ("antialiasing", "feature_lr", "percent_dense", "opacity_reset_interval")
 LACKS = {"3dgs-2023": ("antialiasing",), "3dgs-2024": (), "c3dgs": ("antialiasing",), "2dgs": ("antialiasing",),
          "taming": ("antialiasing", "feature_lr"),  # it has a second rate for the higher SH bands
-         "dbs": OF_3DGS_ALONE,
+         "dbs": OF_3DGS_ALONE, "compact-3dgs": ("antialiasing", "sh_degree"),  # its colours are of degree 0
          **dict.fromkeys(("hac", "hac-plus"), (*OF_3DGS_ALONE, "sh_degree", "sh_degree_interval", "opacity_lr",
                                                "rotation_lr", "densify_from_iter", "densify_until_iter",
                                                "densification_interval"))}
@@ -55,11 +57,19 @@ def read_json(path: Union[str, Path]) -> Any:
 
 
 def blend_of(row: Mapping[str, Any]) -> str:
-    """Such as "smoe 0.05" or "smoe learned"; rows that say no gate are of 0."""
-    gate = row.get("background_gate") or 0
-    if row["blend_mode"] not in GATED_MODES or gate == 0:
-        return row["blend_mode"]
-    return f"{row['blend_mode']} {gate if isinstance(gate, str) else format(gate, 'g')}"
+    """Such as "smoe 0.05", "smoe learned" or "smoe paper"; rows that say no gate are of 0."""
+    mode, gate, faint = row["blend_mode"], row.get("background_gate") or 0, row.get("faint_below")
+    if is_paper(row):
+        return f"{mode} {PAPER}"
+    if mode not in GATED_MODES:
+        return mode
+    said = [mode, *([] if gate == 0 else [gate if isinstance(gate, str) else format(gate, "g")])]
+    return " ".join([*said, *([] if faint is None else ["all" if faint >= EVERYWHERE else f"below {faint:g}"])])
+
+
+def is_paper(row: Mapping[str, Any]) -> bool:
+    """Whether a row or a cell is of the program of the paper's authors."""
+    return all(row.get(name) == value for name, value in PAPER_PROGRAM.items())
 
 
 def net_of(kind: str) -> str:

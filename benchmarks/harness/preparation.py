@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from typing import Any, Dict, List
+from typing import Any, Dict, List, Tuple
 
 from .. import patches
 from ..system.files import write_json_atomically
@@ -12,6 +12,7 @@ from .names import CHECKOUTS, NATIVE
 from .protocol import commit_of
 from .rows import read_object
 
+Cells = List[Dict[str, Any]]
 # The fields of a method that name checkouts, and what is wanted there, in words.
 CHECKOUT_FIELDS = {"path": "a checkout of {} must be",
                    "base": "the 3DGS checkout must be that trains what {} compresses"}
@@ -19,14 +20,36 @@ NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", 
 
 
 def what_is_missing(cells: List[Dict[str, Any]]) -> List[str]:
+    """The scenes, and the checkouts, that some of these cells need and that are not there, in words."""
     scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
     methods = {cell["method"]["label"]: cell["method"] for cell in cells}
-    absent = [f"{part['unset']}; set it" for part in (*scenes.values(), *methods.values()) if "unset" in part]
-    wanted = [(scene, "path", f"scene {name}", "") for name, scene in scenes.items() if scene["path"] is not None]
-    wanted += [(method, key, f"method {label}: {key}", f", where {text.format(method['name'])}")
-               for label, method in methods.items() for key, text in CHECKOUT_FIELDS.items() if key in method]
-    return absent + [f"{what}: {part[key]}: no such folder{where}; name it" for part, key, what, where in wanted
-                     if "unset" not in part and not os.path.isdir(part[key])]
+    found = [_missing(scene, "path", f"scene {name}") for name, scene in scenes.items() if scene["path"] is not None]
+    found += [_missing_checkout(method) for method in methods.values()]
+    return list(dict.fromkeys(filter(None, found)))
+
+
+def without_absent_checkouts(cells: Cells, to_do: Cells) -> Tuple[Cells, Cells, List[str]]:
+    """Both without the cells to do whose checkout is not there, if others remain; and in words what is left out."""
+    absent = {cell["method"]["label"]: _missing_checkout(cell["method"]) for cell in to_do}
+    gone = {label for label, words in absent.items() if words}
+    if len(gone) == len({cell["method"]["label"] for cell in cells}):
+        return cells, to_do, []
+    kept = [cell for cell in to_do if cell["method"]["label"] not in gone]
+    out = [cell["id"] for cell in to_do if cell["method"]["label"] in gone]
+    return ([cell for cell in cells if cell["id"] not in out], kept,
+            [f"left out: {absent[label]}" for label in sorted(gone)])
+
+
+def _missing_checkout(method: Dict[str, Any]) -> str:
+    found = (_missing(method, key, f"method {method['label']}: {key}", f", where {text.format(method['name'])}")
+             for key, text in CHECKOUT_FIELDS.items() if key in method)
+    return next(filter(None, found), "")
+
+
+def _missing(part: Dict[str, Any], key: str, what: str, where: str = "") -> str:
+    if "unset" in part:
+        return f"{part['unset']}; set it"
+    return "" if os.path.isdir(part[key]) else f"{what}: {part[key]}: no such folder{where}; name it"
 
 
 def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:

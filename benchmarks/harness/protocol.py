@@ -42,7 +42,8 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
     protocol, scene = cell["protocol"], cell["scene"]
     config = TrainConfig(
         scene=scene["path"] or "", output=output, blend_mode=cell["blend_mode"],
-        background_gate=cell["background_gate"], iterations=protocol["iterations"], batch=protocol.get("batch", 1),
+        background_gate=cell["background_gate"], faint_below=cell.get("faint_below"),
+        iterations=protocol["iterations"], batch=protocol.get("batch", 1),
         resolution=scene["resolution"], images=scene["images"], principal_point=protocol["principal_point"],
         white_background=scene["background"] == "white", init_points=scene["init_points"],
         strategy=cell["strategy"] or "3dgs", budget=cell.get("budget", 0), seed=cell["seed"], device=protocol["device"],

@@ -51,8 +51,8 @@ RowFile = create_model(
     blend_mode=(str, ...), scene=(str, ...), seed=(int, ...),
     **_may_be(str, "label", "variant", "strategy", "dataset", "end", "reason"), **_may_be(int, "budget", "iterations"),
     **_may_be(Gate, "background_gate"), **_may_be(Decibels, "psnr", "psnr_float", "psnr_edge"),
-    **_may_be(Number, "densify_grad_threshold", "ssim", "num_gaussians", "train_seconds", "wall_seconds", "fps",
-              "peak_gpu_mib"),
+    **_may_be(Number, "densify_grad_threshold", "faint_below", "ssim", "num_gaussians", "train_seconds", "wall_seconds",
+              "fps", "peak_gpu_mib"),
     **_may_be(Dict[str, Any], "protocol", "commit"), **_may_be(Size, "size_bytes"), **_may_be(Machine, "machine"),
     **_may_be(Lpips, "lpips"), **_may_be(List[Optional[Lpips]], "lpips_all"))
 CellRow = create_model(  # of `dsmoe bench run`: it says all that its cell's name says

@@ -8,7 +8,7 @@ from typing import Any, Dict, List, Literal, Tuple, Type
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 from typing_extensions import Annotated
 
-from diff_smoe_rasterization.settings import BLEND_MODES
+from diff_smoe_rasterization.settings import BLEND_MODES, MAX_BACKGROUND_GATE, PAPER
 
 from ..config import LEARNED, PRINCIPAL_POINTS, STRATEGY_NAMES, TrainConfig
 from .errors import BenchError
@@ -47,6 +47,8 @@ Budget = Annotated[int, must(lambda value: value == 0 or value >= 4, "it must be
 Threshold = Annotated[float, Field(gt=0, le=1e6)]  # its digits become a part of file names
 Gate = Annotated[Any, must(lambda value: value == LEARNED or (type(value) in (int, float) and 0 <= value < math.inf),
                            f"it must be a number of at least 0, or {LEARNED!r}")]
+Faint = Annotated[Any, must(lambda value: value is None or (
+    type(value) in (int, float) and 0 <= value <= MAX_BACKGROUND_GATE), "it must be a number of at least 0, or null")]
 Word = Annotated[Any, must(lambda value: type(value) in (str, int, float), "it must be text or a number")]
 Resolution = Annotated[int, must(lambda value: value == -1 or value >= 1, "it must be -1 or at least 1")]
 Background = Literal["black", "white"]
@@ -69,8 +71,9 @@ class Part(BaseModel):
 class Axes(Part):
     """What a suite varies; the axes of a scene and of a method win."""
 
-    blend_modes: some(one_of(BLEND_MODES)) = ["alpha", "smoe"]
+    blend_modes: some(one_of((*BLEND_MODES, PAPER))) = ["alpha", "smoe"]
     background_gates: some(Gate) = [0]
+    faint_belows: some(Faint) = [None]
     densify_grad_thresholds: some(Threshold) = list(THRESHOLDS)
     strategies: some(one_of(STRATEGY_NAMES)) = ["3dgs"]
     budgets: some(Budget) = [0]

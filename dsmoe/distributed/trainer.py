@@ -8,7 +8,7 @@ import torch
 from ..config import TrainConfig
 from ..errors import TrainerError
 from ..model import PARAMETERS, GaussianModel
-from ..results.evaluation import Evaluation, rows_of_views, summary
+from ..results.evaluation import Evaluation, Measure, rows_of_views, summary
 from ..results.rendering import Rasterize
 from ..scenes.images import View
 from ..scenes.scene import Scene
@@ -47,9 +47,9 @@ class BatchTrainer(Trainer):
         """Whether a process was asked to stop before the latest step, which all learn in that step."""
         return self.batches.asked
 
-    def evaluate(self, progress: bool = False) -> Evaluation:
-        """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
-        group, device, views, shown = self.group, self.config.device, self.scene.test, self.result()
+    def _evaluate(self, views: Sequence[View], progress: bool, measure: Measure, passes: int) -> Evaluation:
+        """Each view in one of the processes; a time of a view is that of all by their number."""
+        group, device, shown = self.group, self.config.device, self.result()
 
         def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:
             settings = [shown.settings_of(view.camera) for view in some]
@@ -60,7 +60,7 @@ class BatchTrainer(Trainer):
             return max(group.gather_numbers([round(1000 * seconds)], device))[0] / 1000
 
         batches = [views[begin:begin + group.size] for begin in range(0, len(views), group.size)]
-        by_process = group.gather_objects(rows_of_views(render, batches, device, progress, agreed=longest))
+        by_process = group.gather_objects(rows_of_views(render, batches, device, progress, measure, passes, longest))
         return summary([by_process[index % group.size][index // group.size]  # type: ignore[index]
                         for index in range(len(views))])
 
@@ -76,9 +76,7 @@ class BatchTrainer(Trainer):
             state[name] = _map_tensors(state[name], self.divided.whole)
         state["average"] = {name: self.divided.whole(tensor) if name in PARAMETERS else tensor
                             for name, tensor in state["average"].items()}
-        if state["random"]["cuda"]:
-            state["random"]["cuda"] = [torch.cuda.get_rng_state()]  # all processes draw the same numbers
-        return state
+        return state  # with the generators of one process, as all draw the same numbers
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         """Takes what `state_dict` gave, in whatever number of processes, on the host."""
@@ -87,10 +85,7 @@ class BatchTrainer(Trainer):
         own = {name: _map_tensors(state[name], self.divided.own_rows) for name in ("raw", "optimizer", "strategy")}
         own["average"] = {name: self.divided.own_rows(tensor) if name in PARAMETERS else tensor.to(self.config.device)
                           for name, tensor in state["average"].items()}
-        generators = state["random"]["cuda"]
-        super().load_state_dict({**state, **own, "random": {**state["random"], "cuda": []}})
-        if generators and torch.cuda.is_available():
-            torch.cuda.set_rng_state(generators[0].cpu())
+        super().load_state_dict({**state, **own})
 
 
 def new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None,

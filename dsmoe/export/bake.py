@@ -2,12 +2,14 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any, Dict, NamedTuple, Optional
 
 from diff_smoe_rasterization.settings import resolve_background_gate
 
 from ..config import TrainConfig
 from ..errors import TrainerError
+from ..inspection import compared
 from ..model import GaussianModel, finite_rows
 from ..results.evaluation import evaluate
 from ..results.rendering import Renderer
@@ -77,11 +79,12 @@ class _Baking(Run):
         return {}
 
 
-def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: bool = True) -> Baked:
+def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: bool = True,
+         run: Optional[TrainConfig] = None) -> Baked:
     """Fine-tunes the renderer's Gaussians to alpha, by config's scene and options on config.device.
 
-    Gaussians are neither added nor removed. In a mode without a background gate the whole training is in alpha. Raises
-    TrainerError.
+    Gaussians are neither added nor removed. In a mode without a background gate the whole training is in alpha. run:
+    that of the model; a line says if the scene is not the one that it was trained on. Raises TrainerError.
     """
     mode, gate = renderer.blend_mode, float(renderer.background_gate)
     if not viewer_warning({"blend_mode": mode, "background_gate": gate}):
@@ -96,7 +99,11 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
         # Trained positions move little: they start at the geometric mean of the run's rates.
         position_lr_init=math.sqrt(config.position_lr_init * config.position_lr_final),
         position_lr_final=config.position_lr_final)
-    trainer = Trainer(config, load_scene(config, progress, checksums=False))
+    scene = load_scene(config, progress, checksums=run is not None)
+    note = compared(scene, run)[0] if run else ""
+    if note:
+        print(note, file=sys.stderr)
+    trainer = Trainer(config, scene)
     shown = finite_rows(renderer.model.raw)  # the rasterizer leaves out the others, and so do the formats
     trainer.optimizer.replace_all({name: tensor.detach()[shown] for name, tensor in renderer.model.raw.items()})
     trainer.model.active_sh_degree = renderer.model.active_sh_degree

@@ -62,7 +62,7 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
 def _stored(trained: Trained, folder: str) -> Trained:
     """The model of a checkpoint with a .ply in the folder."""
     renderer, ply = trained.renderer, os.path.join(folder, "model.ply")
-    save_model(ply, renderer.model, renderer.blend_mode, float(renderer.background_gate))
+    save_model(ply, renderer.model, renderer.blend_mode, float(renderer.background_gate), renderer.faint_below)
     return dataclasses.replace(trained, path=ply)
 
 
@@ -73,7 +73,8 @@ def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str
     config, before = trained.config, trained.renderer
     if not is_folder(config.scene):
         raise TrainerError("--bake trains on the scene's images; name the scene's folder with --scene")
-    baked = bake(config.changed(output=folder, device=str(before.background.device.type)), before, iterations)
+    baked = bake(config.changed(output=folder, device=str(before.background.device.type)), before, iterations,
+                 run=config if config.output else None)
     ply = os.path.join(folder, "baked.ply")
     save_model(ply, baked.renderer.model, baked.renderer.blend_mode, 1.0)
     name = blend_name(before.blend_mode, float(before.background_gate))

@@ -1,4 +1,4 @@
-"""Binary glTF with Khronos' extension KHR_gaussian_splatting, whose viewers blend by alpha."""
+"""Binary glTF with Khronos' extension KHR_gaussian_splatting, written and read; its viewers blend by alpha."""
 from __future__ import annotations
 
 import json
@@ -12,7 +12,7 @@ from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
 from ..scenes.pointcloud import SH_C0
-from .rows import rotatable_rows, sigmoid, y_up
+from .rows import logits, rotatable_rows, sigmoid, y_up
 
 SPLATTING = "KHR_gaussian_splatting"
 BLEND = "DSMOE_gaussian_splatting_blend"
@@ -61,6 +61,50 @@ def glb_bytes(gaussians: Gaussians, blend: Optional[Blend]) -> bytes:
                            "--sh-degree makes it smaller")
     return b"".join([struct.pack("<4sII", b"glTF", 2, length), struct.pack("<I4s", len(text), b"JSON"), text,
                      struct.pack("<I4s", offset, b"BIN\0"), *(array.tobytes() for array in attributes.values())])
+
+
+def glb_gaussians(content: bytes) -> Gaussians:
+    """What a file holds: the first primitive of Gaussians, in float32. Raises ValueError if there is none."""
+    try:
+        magic, _, _, length, kind = struct.unpack_from("<4s2II4s", content)
+        if (magic, kind) != (b"glTF", b"JSON"):
+            raise ValueError("it is no binary glTF")
+        document, binary = json.loads(content[20:20 + length]), content[28 + length:]
+        primitives = [primitive for mesh in document["meshes"] for primitive in mesh["primitives"]
+                      if SPLATTING in primitive.get("extensions", {})]
+        if not primitives:
+            raise ValueError(f"it holds no Gaussians of {SPLATTING}")
+        blend = primitives[0]["extensions"][SPLATTING].get("extensions", {}).get(BLEND, {})
+        arrays = {name: _read(document, binary, index) for name, index in primitives[0]["attributes"].items()
+                  if name != "COLOR_0"}
+        position, harmonics = arrays["POSITION"], []
+        for degree in range(4):
+            names = [f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{place}" for place in range(2 * degree + 1)]
+            if not all(name in arrays for name in names):
+                break
+            harmonics += [arrays[name] for name in names]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_scales = np.log(arrays[f"{SPLATTING}:SCALE"])
+        gaussians = Gaussians(
+            means3D=position, dc=harmonics[0][:, None],
+            shs=np.stack(harmonics[1:], 1) if harmonics[1:] else np.zeros((len(position), 0, 3), np.float32),
+            opacity_logits=logits(arrays[f"{SPLATTING}:OPACITY"]).astype(np.float32), log_scales=log_scales,
+            rotations=arrays[f"{SPLATTING}:ROTATION"][:, [3, 0, 1, 2]],
+            blend_mode=blend.get("blendMode", "alpha"), background_gate=blend.get("backgroundGate"))
+    except (KeyError, IndexError, TypeError, AttributeError, struct.error, RecursionError) as error:
+        raise ValueError(f"not a .glb of Gaussians ({error})") from error
+    return y_up(gaussians)
+
+
+def _read(document: Dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+    """An accessor of float32, [N, width]. Raises ValueError for another type, and for one that is not there."""
+    accessor = document["accessors"][index]
+    view = document["bufferViews"][accessor["bufferView"]]
+    width = {name: width for width, name in TYPES.items()}[accessor["type"]]
+    if accessor["componentType"] != FLOAT or view.get("byteStride", 4 * width) != 4 * width:
+        raise ValueError("its Gaussians are not in float32 without gaps; only such are read")
+    offset = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    return np.frombuffer(binary, "<f4", accessor["count"] * width, offset).reshape(-1, width)
 
 
 def _document(blend: Optional[Blend]) -> Dict[str, Any]:

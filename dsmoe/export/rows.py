@@ -15,11 +15,19 @@ from ..results.modelfile import raw_of
 TURNED_AXES = np.array([1, -1, -1], np.float32)
 TURNED_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
+LEAST_OPACITY = 1e-5  # and the greatest is as far from 1: of formats that hold no logits
+
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
     """Opacities of logits, in float64."""
     with np.errstate(over="ignore"):  # exp(1000) is infinite, and the opacity 0
         return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+
+def logits(opacities: np.ndarray) -> np.ndarray:
+    """Of opacities in 8 bits or float32, among which 0 and 1 have infinite ones."""
+    clipped = opacities.astype(np.float64).clip(LEAST_OPACITY, 1 - LEAST_OPACITY)
+    return np.log(clipped / (1 - clipped))
 
 
 def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:

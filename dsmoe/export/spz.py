@@ -1,4 +1,4 @@
-"""The .spz format of Niantic: compressed, about a tenth of a .ply. The library gsply writes it."""
+"""The .spz format of Niantic: compressed, about a tenth of a .ply. The library gsply writes and reads it."""
 from __future__ import annotations
 
 import math
@@ -16,9 +16,11 @@ from .rows import rotatable_rows, y_up
 # Bits behind the point of a coordinate, which has 24 bits. The fewest reach to 8192 units, in steps of a thousandth.
 FEWEST_FRACTIONAL_BITS, MOST_FRACTIONAL_BITS = 10, 20
 
+LARGEST_LOGIT = 30.0  # of opacities, which the format holds in 8 bits
+
 
 def check_spz() -> None:
-    """Raises TrainerError if this environment cannot write such a file."""
+    """Raises TrainerError if this environment can neither write nor read such a file."""
     try:
         import gsply  # noqa: F401
     except ImportError as error:
@@ -40,13 +42,35 @@ def spz_bytes(gaussians: Gaussians) -> bytes:
     excess = (np.abs(position).max(axis=1, keepdims=True, initial=0) / limit).clip(min=1)
     position, log_scales = position / excess, log_scales - np.log(excess)
     data = gsply.GSData.from_arrays(
-        means=position, scales=log_scales, quats=rotations, opacities=logit[:, 0].clip(-30, 30), sh0=dc,
+        means=position, scales=log_scales, quats=rotations, sh0=dc,
+        opacities=logit[:, 0].clip(-LARGEST_LOGIT, LARGEST_LOGIT),
         shN=harmonics.reshape(len(harmonics), -1, 3) if harmonics.shape[1] else None, format="ply")
     with tempfile.TemporaryDirectory() as folder:  # gsply writes to a path only
         path = os.path.join(folder, "model.spz")
         gsply.write_spz(path, data, version=3, fractional_bits=fractional_bits(position))
         with open(path, "rb") as file:
             return file.read()
+
+
+def spz_gaussians(content: bytes) -> Gaussians:
+    """What a file holds. Raises TrainerError without gsply, ValueError if it is none."""
+    check_spz()
+    import gsply
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "model.spz")
+        with open(path, "wb") as file:
+            file.write(content)
+        try:
+            data = gsply.read_spz(path)
+        except Exception as error:  # gsply's own, and of zlib
+            raise ValueError(f"gsply cannot read it: {error}") from error
+    count = len(data.means)
+    arrays = {"means3D": data.means, "dc": data.sh0.reshape(count, 1, 3),
+              "shs": np.zeros((count, 0, 3)) if data.shN is None else data.shN.reshape(count, -1, 3),
+              "opacity_logits": data.opacities.reshape(count, 1).clip(-LARGEST_LOGIT, LARGEST_LOGIT),
+              "log_scales": data.scales, "rotations": data.quats}
+    return y_up(Gaussians(**{name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}))
 
 
 def fractional_bits(positions: np.ndarray) -> int:

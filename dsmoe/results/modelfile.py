@@ -1,8 +1,9 @@
-"""GaussianModel to and from Inria-format .ply files, whose comments record blend mode and background gate."""
+"""GaussianModel to and from Inria-format .ply files, whose comments record how Gaussians are blended."""
 from __future__ import annotations
 
 import os
-from typing import Dict, NamedTuple, Optional, Tuple
+import sys
+from typing import Dict, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
@@ -11,12 +12,14 @@ from diff_smoe_rasterization.settings import (
     BLEND_MODES,
     GATED_MODES,
     resolve_background_gate,
+    resolve_faint_below,
 )
 
-from ..errors import TrainerError
+from ..errors import TrainerError, printable
 from ..model import GaussianModel, finite_rows
 from ..system.files import new_file
 
+FAINT_BELOW = "faint_below"  # in comments
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, as viewers of 3DGS expect it
 
 
@@ -25,6 +28,7 @@ class Recorded(NamedTuple):
 
     blend_mode: Optional[str]
     background_gate: Optional[float]
+    faint_below: Optional[float] = None  # also: as usual
 
 
 def model_path(output: str, iteration: int) -> str:
@@ -32,13 +36,18 @@ def model_path(output: str, iteration: int) -> str:
     return os.path.join(output, FOLDER, f"iteration_{iteration}", "point_cloud.ply")
 
 
-def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:
-    """Writes the raw parameters, `comment blend_mode NAME` and in GATED_MODES `comment background_gate VALUE`."""
+def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float,
+               faint_below: Optional[float] = None) -> None:
+    """Writes the raw parameters, `comment blend_mode NAME` and in GATED_MODES `comment background_gate VALUE`.
+
+    And `comment faint_below VALUE`, if there is one.
+    """
     raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
     gaussians = io.Gaussians(
         means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
         log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode,
-        background_gate=background_gate if blend_mode in GATED_MODES else None)
+        background_gate=background_gate if blend_mode in GATED_MODES else None,
+        comments=() if faint_below is None else (f"{FAINT_BELOW} {faint_below:g}",))
     with new_file(path) as temporary:
         io.write_gaussians(temporary, gaussians)
 
@@ -48,20 +57,33 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
 
     Raises TrainerError naming file and reason, also if no Gaussian can be shown.
     """
+    stored = read_ply(path)
+    raw = raw_of(stored, device)
+    if len(stored.means3D) and not finite_rows(raw).any():
+        raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
+                           "infinite, so the rasterizer shows none; was the training diverging?")
+    model = GaussianModel.from_gaussians(raw, stored.sh_degree)
+    return model, Recorded(stored.blend_mode, stored.background_gate, recorded_faint(path, stored.comments))
+
+
+def read_ply(path: str) -> io.Gaussians:
+    """Reads a .ply. Raises TrainerError naming file and reason."""
     try:
-        stored = io.read_gaussians(path)
+        return io.read_gaussians(path)
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
         other = "; it is no model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
         raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
-    raw = raw_of(stored, device)
-    if len(stored.means3D) and not finite_rows(raw).any():
-        raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
-                           "infinite, so the rasterizer shows none; was the training diverging?")
-    model = GaussianModel(raw, stored.sh_degree)
-    model.active_sh_degree = stored.sh_degree
-    return model, Recorded(stored.blend_mode, stored.background_gate)
+
+
+def recorded_faint(path: str, comments: Sequence[str]) -> Optional[float]:
+    said = [line.partition(" ")[2] for line in comments if line.startswith(FAINT_BELOW + " ")]
+    try:
+        return resolve_faint_below("smoe", float(said[-1])) if said else None
+    except ValueError as error:
+        raise TrainerError(f"{path}: its comment records {FAINT_BELOW} {said[-1]!r}; it must be a number of at least 0"
+                           ) from error
 
 
 def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:
@@ -72,16 +94,17 @@ def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tens
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
-    """The blend mode to render a .ply with: the recorded one, or the one asked for if none is recorded.
+    """The blend mode to render a .ply with: the recorded one, else the one asked for, else alpha, which a line says.
 
-    Raises TrainerError if neither is known, if they disagree, or if the recorded one is unknown.
+    Raises TrainerError if both disagree, or the recorded one is unknown.
     """
     if recorded is not None and recorded not in BLEND_MODES:
         raise TrainerError(f"{path}: its comment records the blend mode {recorded!r}; this version knows "
                            f"{', '.join(BLEND_MODES)}")
     if recorded is None and asked is None:
-        raise TrainerError(f"{path} does not say which blend mode it was trained with (no `comment blend_mode`); "
-                           "pass --blend-mode, which is alpha for files of other 3DGS programs")
+        print(f"note: {printable(path)} records no blend mode, so it is alpha, as other 3DGS programs blend; "
+              "--blend-mode says otherwise", file=sys.stderr)
+        return "alpha"
     if recorded is not None and asked is not None and asked != recorded:
         raise TrainerError(f"{path} was trained with the blend mode {recorded}, not {asked}; "
                            "in another mode its Gaussians show another scene")

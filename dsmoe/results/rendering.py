@@ -29,15 +29,17 @@ class Renderer:
 
     def __init__(self, model: GaussianModel, blend_mode: str, background: torch.Tensor,
                  antialiasing: bool = False, rasterize: Optional[Rasterize] = None, *,
-                 background_gate: BackgroundGate, deterministic: bool = False) -> None:
+                 background_gate: BackgroundGate, faint_below: Optional[float] = None,
+                 deterministic: bool = False) -> None:
         """background: [3] on the model's device. rasterize: by default the package's.
 
-        background_gate: of `smoe`; the other modes have their own. A tensor has no gradient, and may change.
+        background_gate, faint_below: of GATED_MODES. A tensor has no gradient, and may change.
         """
         self.model = model
         self.blend_mode = blend_mode
         self.background = background
         self.background_gate = background_gate
+        self.faint_below = faint_below
         self.antialiasing = antialiasing
         self.deterministic = deterministic
         self.rasterize = rasterize or package_rasterizer()
@@ -93,6 +95,7 @@ class Renderer:
             changes["bg"] = background
         if self.blend_mode in GATED_MODES:
             changes["background_gate"] = self.background_gate if background_gate is None else background_gate
+            changes["faint_below"] = self.faint_below
         return self._settings[id(camera)][1]._replace(**changes)
 
 

@@ -21,10 +21,12 @@ RESULTS_NAME = "results.json"
 
 
 def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seconds: Optional[float],
-               evaluation: Evaluation, background_gate: Optional[float] = None) -> Dict[str, Any]:
+               evaluation: Evaluation, psnr_train: Optional[float] = None, background_gate: Optional[float] = None
+               ) -> Dict[str, Any]:
     """One row: the figures first, then the protocol that makes them comparable.
 
-    background_gate: the one that was rendered with; None: the config's.
+    psnr_train: over the training views, if it was measured. background_gate: the one that was rendered with; None: the
+    config's.
     """
     views = list(scene.test) or list(scene.train)
     first = views[0].camera
@@ -36,12 +38,16 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         for name in ("background_gate_start", "background_gate_lr"):
             if getattr(config, name) != usual[name]:
                 unusual[name] = getattr(config, name)
+    if config.faint_below is not None:
+        unusual["faint_below"] = config.faint_below
     if config.batch > 1:
         unusual["batch"] = config.batch
     if config.deterministic:
         unusual["deterministic"] = True
     if config.budget:
         unusual["budget"] = config.budget
+    if config.init:
+        unusual["init"] = os.path.basename(config.init)
     if config.strategy == "importance":  # with the defaults of this version
         unusual.update(strategy_options=importance_settings(config.importance_options()),
                        densify_until_iter=config.densify_until_iter)
@@ -60,6 +66,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         "blend_mode": config.blend_mode,
         "background_gate": config.background_gate if background_gate is None else background_gate,
         **evaluation.metrics,
+        "psnr_train": psnr_train,
         "num_gaussians": num_gaussians,
         "train_seconds": train_seconds,  # only the loop: without loading, evaluation and checkpoints
         "fps": evaluation.fps,
@@ -115,21 +122,26 @@ def read_results(folder: str) -> List[Dict[str, Any]]:
 def results_table(rows: List[Dict[str, Any]]) -> str:
     """Rows as a text table: blend mode and gate, PSNR, SSIM, #Gaussians, training seconds, frames per second."""
     header = ("blend mode", "PSNR [dB]", "SSIM", "#Gaussians", "train [s]", "FPS")
-    body = [(blend_name(row["blend_mode"], row.get("background_gate")), _number(row["psnr"], 2),
-             _number(row["ssim"], 4), f"{row['num_gaussians']:,}", _number(row["train_seconds"], 1),
-             _number(row["fps"], 1)) for row in rows]
+    body = [(blend_name(row["blend_mode"], row.get("background_gate"), row.get("protocol", {}).get("faint_below")),
+             _number(row["psnr"], 2), _number(row["ssim"], 4), f"{row['num_gaussians']:,}",
+             _number(row["train_seconds"], 1), _number(row["fps"], 1)) for row in rows]
     widths = [max(len(line[column]) for line in [header, *body]) for column in range(len(header))]
     lines = ["  ".join(cell.ljust(width) if column == 0 else cell.rjust(width)
                        for column, (cell, width) in enumerate(zip(line, widths))) for line in [header, *body]]
     return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
 
 
-def blend_name(blend_mode: str, background_gate: Union[float, str, None]) -> str:
-    """The blend in words: the mode, in GATED_MODES with its background gate, such as "smoe (gate 0.022)"."""
+def blend_name(blend_mode: str, background_gate: Union[float, str, None], faint_below: Optional[float] = None) -> str:
+    """The blend in words: the mode, in GATED_MODES with its background gate, such as "smoe (gate 0.022)".
+
+    And with its `faint_below`, if that is not as usual.
+    """
     if blend_mode not in GATED_MODES or background_gate is None:
         return blend_mode
     gate = background_gate if isinstance(background_gate, str) else format(background_gate, ".2g")
-    return f"{blend_mode} (gate {gate})"
+    if faint_below is None:
+        return f"{blend_mode} (gate {gate})"
+    return f"{blend_mode} (gate {gate}, {'all pairs' if faint_below > 1 else f'faint below {faint_below:g}'})"
 
 
 def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:

@@ -212,6 +212,21 @@ def _opacity(image: Image.Image) -> Optional[Image.Image]:
     return image.convert("RGBA").getchannel("A") if is_transparent(image) else None
 
 
+def size_of_image(posed: PosedImage) -> Tuple[int, int]:
+    """(width, height) of an image that is not read yet; of one that is to be rendered, its camera's. Raises SceneError.
+    """
+    return image_size(posed.path) if posed.path else (posed.camera.width, posed.camera.height)
+
+
+def has_transparency(path: str) -> bool:
+    """`is_transparent` of a file, by its header. Raises SceneError."""
+    try:
+        with open_image(path) as file:
+            return is_transparent(file)
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
+
+
 def image_size(path: str) -> Tuple[int, int]:
     """(width, height) from an image's header. Raises SceneError."""
     return _size(path, path)

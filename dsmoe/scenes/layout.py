@@ -30,11 +30,12 @@ class PosedImage:
 class Layout:
     """What a scene folder says, images unread."""
 
-    kind: str  # "colmap", "transforms" or "nerf-synthetic"
+    kind: str  # "colmap", "transforms", "nerf-synthetic" or "model"
     train: Sequence[PosedImage]
     test: Sequence[PosedImage]
     points: PointCloud
     split: str  # how test images are chosen, for the protocol
+    model: str = ""  # the .ply whose renderings are the images; empty: these are files
     missing: Sequence[str] = ()  # images that the folder names and has not, by name; they are in neither list
 
     @property

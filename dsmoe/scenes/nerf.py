@@ -104,7 +104,7 @@ def random_points(count: int, seed: int, middle: Any = (0.0, 0.0, 0.0), half_sid
     """Uniform points in a cube, all but grey, as 3DGS starts on NeRF-synthetic scenes."""
     random = np.random.RandomState(seed)
     positions = random.uniform(-half_side, half_side, (count, 3)) + np.asarray(middle)
-    return PointCloud(positions, 0.5 + SH_C0 * random.uniform(0, 1 / 255, (count, 3)))
+    return PointCloud(positions, 0.5 + SH_C0 * random.uniform(0, 1 / 255, (count, 3)), measured=False)
 
 
 def _read_points(path: str) -> PointCloud:

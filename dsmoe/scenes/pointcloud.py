@@ -1,6 +1,7 @@
 """Coloured points that Gaussians start from."""
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +18,14 @@ class PointCloud:
 
     positions: np.ndarray  # [N, 3] float64, world
     colors: np.ndarray  # [N, 3] float64 in [0, 1]
+    measured: bool = True  # of the scene; False: random ones, whose number says nothing of it
 
     def subset(self, count: int, seed: int) -> PointCloud:
         """A random choice of `count` points, in their original order; all of them if there are no more."""
         if count == 0 or count >= len(self.positions):
             return self
         chosen = np.sort(np.random.RandomState(seed).choice(len(self.positions), count, replace=False))
-        return PointCloud(self.positions[chosen], self.colors[chosen])
+        return dataclasses.replace(self, positions=self.positions[chosen], colors=self.colors[chosen])
 
     def checked(self, source: str) -> PointCloud:
         """Returns self; raises SceneError naming `source` if there are too few points or float32 cannot hold one."""

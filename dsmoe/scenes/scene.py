@@ -1,7 +1,7 @@
 """Loads a scene folder: cameras, images, the train/test split and the points to start from.
 
-Three kinds are known: COLMAP (a sparse model beside a folder of images), transforms.json, and NeRF-synthetic
-(transforms_train.json).
+Four kinds are known: COLMAP (a sparse model beside a folder of images), transforms.json, NeRF-synthetic
+(transforms_train.json), and the folder of a trained model (cameras.json), whose images are its renderings.
 Everything that can be wrong with a folder is a SceneError here, before training starts.
 """
 from __future__ import annotations
@@ -11,21 +11,26 @@ import hashlib
 import os
 import sys
 from dataclasses import dataclass
-from typing import Any, Dict, Hashable, Iterable, List, Mapping, Optional, Sequence
+from typing import TYPE_CHECKING, Any, Callable, Dict, Hashable, Iterable, List, Mapping, Optional, Sequence
 
 import numpy as np
 
 from ..config import IMAGES, TrainConfig
+from ..early import check_scene
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
 from ..system.process import command
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
-from .images import MAX_WIDTH, View, fitted_camera, image_size, load_views
+from .images import MAX_WIDTH, View, fitted_camera, load_views, size_of_image
 from .layout import Layout, PosedImage, with_masks, without_missing
+from .modelfolder import CAMERAS, read_model_layout, rendered_views
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
 from .undistortion import undistorted
+
+if TYPE_CHECKING:
+    from ..starting import Start
 
 
 @dataclass(frozen=True)
@@ -40,12 +45,24 @@ class Scene:
     split: str
     note: str = ""  # what was done to its images, in a line
     missing: int = 0  # images that were left out
+    start: Optional[Start] = None  # a model to start from, whose places are then the points
 
     def to(self, device: str) -> Scene:
         """The same scene with its images on `device`."""
 
-        return dataclasses.replace(self, train=[view.to(device) for view in self.train],
-                                   test=[view.to(device) for view in self.test])
+        return self._map(lambda view: view.to(device))
+
+    def centred(self) -> Scene:
+        """The same scene as --principal-point centre loads it."""
+        return self._map(lambda view: dataclasses.replace(view, camera=view.camera.centred()))
+
+    def starting_with(self, start: Start) -> Scene:
+        """The same scene with a model to start from."""
+        return dataclasses.replace(self, start=start, points=start.points())
+
+    def _map(self, change: Callable[[View], View]) -> Scene:
+        return dataclasses.replace(self, train=[change(view) for view in self.train],
+                                   test=[change(view) for view in self.test])
 
 
 def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None,
@@ -56,25 +73,32 @@ def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layo
     content, as a training must, which can be resumed. Raises SceneError naming the file and the reason.
     """
     layout, note = undistorted(layout or read_layout(config), config.scene, progress)
-    images = load_views(list(layout.train) + list(layout.test), config, progress, checksums)
+    posed = [*layout.train, *layout.test]
+    images = rendered_views(layout.model, posed, config) if layout.model else load_views(
+        posed, config, progress, checksums)
     train, test = images[:len(layout.train)], images[len(layout.train):]
     points = layout.points.subset(config.init_points, config.seed).subset(config.most_points, config.seed)
     extent = scene_extent(np.stack([view.camera.center for view in train]))
-    return Scene(layout.kind, train, test, points, extent, layout.split, note, len(layout.missing))
+    scene = Scene(layout.kind, train, test, points, extent, layout.split, note, len(layout.missing))
+    if not config.init:
+        return scene
+    from ..starting import read_start  # late: what makes scenes needs no extension
+
+    return scene.starting_with(read_start(config.init))
 
 
 def read_layout(config: TrainConfig) -> Layout:
     """Reads everything of a scene folder but its images, whose presence it checks."""
     folder = config.scene
-    if not is_folder(folder):
-        is_one = "is a file; a scene is a folder" if is_file(folder) else "no such folder"
-        raise SceneError(f"scene {folder}: {is_one}")
+    check_scene(folder)
     if is_file(os.path.join(folder, "transforms_train.json")):
         layout = read_nerf_layout(folder, config)
     elif is_folder(os.path.join(folder, "sparse")):
         layout = read_colmap_layout(folder, config)
     elif is_file(os.path.join(folder, TRANSFORMS)):
         layout = read_transforms_layout(folder, config)
+    elif is_file(os.path.join(folder, CAMERAS)):
+        return _checked(folder, read_model_layout(folder, config))
     else:
         raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
                          "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
@@ -94,12 +118,14 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     """What was loaded, in a line, and what is to be known of it, in further ones; layout: what it was loaded from."""
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
     size = " to ".join(f"{width}x{height}" for width, height in sizes[::max(1, len(sizes) - 1)])
-    first, file_size = scene.train[0].camera, image_size(layout.train[0].path)
+    first, file_size = scene.train[0].camera, size_of_image(layout.train[0])
     if (first.width, first.height) != file_size:
         why = f", at most {MAX_WIDTH} wide" if config.resolution == -1 else ""
         size += f" (scaled from {file_size[0]}x{file_size[1]} by --resolution {config.resolution}{why})"
     count, there = len(scene.points.positions), len(layout.points.positions)
     points = f"{count:,} points" if count == there else f"{count:,} of {there:,} points"
+    if scene.start:
+        points = f"{count:,} Gaussians of a model"
     lines = [layout.warning, scene.note]
     if config.batch > len(scene.train):
         lines.append(f"note: a step of --batch {config.batch} shows some of the {len(scene.train)} training images "
@@ -171,7 +197,7 @@ def load_cameras(config: TrainConfig, split: str) -> List[Camera]:
     if layout.warning:
         print(layout.warning, file=sys.stderr)
     posed = {"train": layout.train, "test": layout.test, "all": list(layout.train) + list(layout.test)}[split]
-    return [fitted_camera(image, image_size(image.path), config) for image in posed]
+    return [fitted_camera(image, size_of_image(image), config) for image in posed]
 
 
 def _identity(image: PosedImage) -> Hashable:
@@ -186,10 +212,10 @@ def _checked(folder: str, layout: Layout) -> Layout:
     Raises SceneError for an image that is there twice, by whatever path, and for a camera that float32 cannot hold.
     """
     every = [*layout.train, *layout.test]
-    both = {*map(_identity, layout.train)} & {*map(_identity, layout.test)}
+    both = set() if layout.model else {*map(_identity, layout.train)} & {*map(_identity, layout.test)}
     if both and layout.kind == "nerf-synthetic":  # each of its files may list any images
         layout = dataclasses.replace(layout, split=f"{layout.split}, {len(both)} of which are training images too")
-    for images in (layout.train, layout.test) if layout.kind == "nerf-synthetic" else (every,):
+    for images in () if layout.model else (layout.train, layout.test) if layout.kind == "nerf-synthetic" else (every,):
         seen: Dict[Hashable, str] = {}
         for image in images:
             name, file = image.camera.name, _identity(image)

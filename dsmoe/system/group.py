@@ -5,6 +5,7 @@ import contextlib
 import datetime
 import os
 import re
+import socket
 import sys
 import threading
 import time
@@ -191,6 +192,8 @@ def join_group(device: str) -> Group:
                                "process needs one: --nproc-per-node must be at most that")
         torch.cuda.set_device(place)
     where = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+    do_not_meet = f"the processes of the training do not meet at {where} (MASTER_ADDR and MASTER_PORT): "
+    _wait_for_name(os.environ["MASTER_ADDR"], do_not_meet)
     said = threading.Timer(PATIENCE, lambda: print(
         f"note: process {os.environ['RANK']} of {os.environ['WORLD_SIZE']} waits for the others at {where}",
         file=sys.stderr, flush=True))
@@ -200,11 +203,26 @@ def join_group(device: str) -> Group:
         torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo", timeout=TIMEOUT)
     except (RuntimeError, ValueError, OSError) as error:
         first = str(error).strip().partition("\n")[0]
-        raise TrainerError(f"the processes of the training do not meet at {where} (MASTER_ADDR and MASTER_PORT): "
-                           f"{first}") from error
+        raise TrainerError(do_not_meet + first) from error
     finally:
         said.cancel()
     return DistributedGroup()
+
+
+def _wait_for_name(name: str, do_not_meet: str) -> None:
+    """Until the name of a host is known, as that of one that starts; torch would try for TIMEOUT.
+
+    Raises TrainerError if it is not within PATIENCE. do_not_meet: the beginning of that error.
+    """
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            socket.getaddrinfo(name, None)
+            return
+        except (OSError, UnicodeError) as error:
+            if time.monotonic() > end:
+                raise TrainerError(f"{do_not_meet}no host of the name {name!r} is known ({error})") from error
+            time.sleep(min(1.0, PATIENCE))
 
 
 def leave_group(group: Group) -> None:

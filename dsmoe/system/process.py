@@ -6,8 +6,10 @@ import os
 import shlex
 import shutil
 import sys
+from typing import TYPE_CHECKING
 
-import torch
+if TYPE_CHECKING:
+    import torch  # which takes seconds to load: the command line takes names from here
 
 # glibc's parameters of mallopt(3) and the largest values that make sense here.
 M_TRIM_THRESHOLD, TRIM_BYTES = -1, 1 << 30
@@ -23,6 +25,8 @@ def set_up_process(device: str) -> None:
     """
     keep_freed_memory()
     if device == "cuda":
+        import torch
+
         torch.set_num_threads(1)
 
 
@@ -56,6 +60,8 @@ def return_spare_memory(device: torch.device) -> None:
     """
     if device.type != "cuda":
         return
+    import torch
+
     stats = torch.cuda.memory_stats(device)
     if stats["reserved_bytes.all.current"] > 2 * stats["allocated_bytes.all.peak"] + SPARE_BYTES:
         torch.cuda.empty_cache()

@@ -19,7 +19,7 @@ from .state_check import Misfit, check_model, check_numbers
 TENSOR = "__tensor__"  # stands for a tensor
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
-FORMAT = 6  # raised when the content changes so that older files cannot be resumed
+FORMAT = 7  # raised when the content changes so that older files cannot be resumed
 
 
 class SoFar(NamedTuple):
@@ -86,15 +86,16 @@ def damage_named(path: str) -> Iterator[None]:
     """Makes a TrainerError of whatever a damaged checkpoint causes while it is read and taken over.
 
     Its text is not torch's, which advises to read such a file with weights_only=False, and so to run code from it.
+    What says nothing of the file stays as it is: no memory, a GPU that fails, a module that this machine lacks.
     """
     try:
         yield
-    except TrainerError:
+    except (TrainerError, ImportError):
         raise
     except Exception as error:
         if isinstance(error, OSError) and error.strerror:
             raise TrainerError(f"{path}: cannot be read: {error.strerror}") from error
-        if out_of_memory(error):
+        if out_of_memory(error) or (isinstance(error, RuntimeError) and "CUDA" in str(error)):
             raise
         text = f"{path}: not a readable checkpoint; remove it, and --resume starts the run anew"
         if isinstance(error, Misfit):

@@ -5,8 +5,9 @@ import time
 from typing import Optional
 
 from ..config import TrainConfig, flags_text
+from ..presets import FAST
 from ..scenes.scene import Scene
-from ..short_run import short_run
+from ..short_run import FLAG, smaller_images
 
 STEPS = 10  # that are measured, behind the first one, which is slower
 ENOUGH_SECONDS = 20.0  # or as many steps as take so long
@@ -19,8 +20,10 @@ class Forecast:
     def __init__(self, config: TrainConfig, scene: Scene) -> None:
         self.config = config
         camera = scene.train[0].camera
-        chosen = short_run("cpu", camera.width, camera.height, len(scene.points.positions))
-        self.shorter = chosen if config.iterations > chosen["iterations"] or len(chosen) > 3 else {}
+        self.removes = scene.start is not None and 0 < config.budget < len(scene.points.positions)
+        smaller = smaller_images(camera.width, camera.height)
+        is_short = self.removes or config.iterations <= FAST["cpu"].iterations and not smaller
+        self.shorter = "" if is_short else f"{FLAG} {flags_text(smaller)}".rstrip()
         self.begun: Optional[float] = None
         self.first = 0
         self.said = False
@@ -42,12 +45,11 @@ class Forecast:
 
     def text(self, left: int, seconds: float) -> str:
         """left: iterations."""
-        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, longer as Gaussians are "
-                "added")
+        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, "
+                + ("less as Gaussians are removed" if self.removes else "longer as Gaussians are added"))
         if seconds < LONG_SECONDS or not self.shorter:
             return line
-        options = f"--overwrite --scale-recipe {flags_text(self.shorter)}"
-        return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: {options}"
+        return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: --overwrite {self.shorter}"
 
 
 def duration(seconds: float) -> str:

@@ -25,7 +25,9 @@ from ..scenes.images import View
 _OPS = torch.ops.diff_smoe_rasterization
 
 WARM_UP = 64  # steps without a graph, from which the room for the lists of tile instances is learned
-MOST_KINDS = 4  # that are captured at a time; of cameras that all differ each would be seen too seldom
+MOST_KINDS = 4  # that are captured at a time: each takes memory
+IDLE = 512  # steps without a replay, after which a graph gives its place to another kind
+MOST_SEEN = 256  # kinds that are remembered; of more than that each comes too seldom
 FULL = 0.8  # a graph whose lists are filled more than this is captured anew: what they do not hold would take long
 SPARE_ROOM = 1.25  # memory of graphs is for so many times the Gaussians: a densification then needs no other memory
 PIXEL_BYTES = 100  # of memory, about, for an image that is rendered and differentiated
@@ -95,12 +97,18 @@ class NoGraphs:
 
 
 class Graphs(NoGraphs):
-    """Captures a kind of step when it comes a second time over the same parameters."""
+    """Captures a kind of step when it comes a second time over the same parameters.
+
+    A capture takes as long as several steps. So a graph stays as long as it is used, and while all places are taken,
+    steps of further kinds are launched.
+    """
 
     def __init__(self) -> None:
         self._memory: List[Any] = []  # weak references
-        self._captured: Dict[Hashable, Optional[Captured]] = {}  # None: seen once
-        self._launched = 0
+        self._captured: Dict[Hashable, Captured] = {}
+        self._used: Dict[Hashable, int] = {}  # the step in which each was replayed last
+        self._seen: Dict[Hashable, None] = {}  # kinds that came before
+        self._steps = self._launched = 0
         self._too_many: float = math.inf  # Gaussians, with whose graphs the memory did not suffice
 
     def kind(self, settings: GaussianRasterizationSettings, loss_rule: Hashable, view: View,
@@ -111,23 +119,36 @@ class Graphs(NoGraphs):
         return common, loss_rule, background is None, view.opacity is None, view.mask is None
 
     def find(self, memory: Sequence[Any], kind: Hashable, capture: Callable[[Captured], None]) -> Optional[Captured]:
+        self._steps += 1
         if len(memory) != len(self._memory) or any(here is not ref() for here, ref in zip(memory, self._memory)):
             self._memory = [weakref.ref(here) for here in memory]
             self._captured.clear()
+            self._seen.clear()
         found = self._captured.get(kind)
         if found is not None and self._is_full(found):
-            found = None
             del self._captured[kind]
+            self._seen.pop(kind, None)  # launched once more, which learns how much room it needs
+            found = None
+        if found is None and self._is_due(kind):
+            found = self._capture(len(memory[0]), capture)
+            if found is not None:
+                self._captured[kind] = found
         if found is None:
-            is_new = kind not in self._captured
-            if is_new and len(self._captured) == MOST_KINDS:
-                del self._captured[next(iter(self._captured))]
-            if is_new or self._launched < WARM_UP:
-                self._captured[kind] = None
-                self._launched += 1
-                return None
-            found = self._captured[kind] = self._capture(len(memory[0]), capture)
+            self._launched += 1
+            self._seen[kind] = None
+            while len(self._seen) > MOST_SEEN:
+                del self._seen[next(iter(self._seen))]
+        else:
+            self._used[kind] = self._steps
         return found
+
+    def _is_due(self, kind: Hashable) -> bool:
+        """Whether a kind without a graph is to be captured: it came before, and there is a place for it."""
+        if kind not in self._seen or self._launched < WARM_UP:
+            return False
+        for other in [other for other in self._captured if self._steps - self._used[other] > IDLE]:
+            del self._captured[other]
+        return len(self._captured) < MOST_KINDS
 
     def _capture(self, num_gaussians: int, capture: Callable[[Captured], None]) -> Optional[Captured]:
         """A new step; None if the memory does not suffice, also when all other graphs are gone."""

@@ -12,6 +12,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import numpy as np
 import torch
 
+from ..config import TrainConfig
 from ..errors import ConfigError
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
@@ -22,6 +23,7 @@ from .strategy import Look, SteadyStrategy, Step, StrategyContext, is_due
 # moves are every 500 until 20,000.
 GROWTH_ENDS = 8 / 15
 REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
+REMOVALS_BEGIN_FROM_MODEL = 0.02  # a model that has enough Gaussians does not grow
 MOVES_END = 4 / 3
 MOVE_INTERVAL = 1 / 30
 
@@ -33,6 +35,8 @@ TERMS = 100  # in densify_until_iter, at least, if that has so many steps
 
 # A view needs a Gaussian if its removal costs more than this there: squared colours, summed over pixels.
 NEEDED_COST = 1e-3
+
+DROPS_UNNEEDED = False  # from a model, before the second step
 
 NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
 NUMBERS_AT_ONCE = 2 ** 22  # coordinates of Gaussians, each seen from every camera: 16 MB of them are in memory
@@ -48,6 +52,21 @@ CHILD_SCALE = 0.65
 CHILD_COVER = 0.744
 
 
+def reached_from(config: TrainConfig, start: int) -> int:
+    """How many Gaussians growth can make of so many: a densification doubles at most."""
+    return start * 2**_densifications(config, config.densify_from_iter)
+
+
+def _growth_end(config: TrainConfig) -> int:
+    return round(GROWTH_ENDS * config.densify_until_iter)
+
+
+def _densifications(config: TrainConfig, behind: int) -> int:
+    """How many densifications of growth come behind an iteration."""
+    return sum(is_due(iteration, config.densification_interval, config.batch)
+               for iteration in range(config.batch, _growth_end(config), config.batch) if iteration > behind)
+
+
 class ImportanceStrategy(SteadyStrategy):
     """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
 
@@ -58,11 +77,13 @@ class ImportanceStrategy(SteadyStrategy):
         context.optimizer.scale_rate("shs", self.options.bands)
         self.start = context.num_gaussians
         until = config.densify_until_iter
-        self.growth_ends = round(GROWTH_ENDS * until)
+        is_enough = bool(config.init) and self.start >= config.budget
+        self.growth_ends = 0 if is_enough else _growth_end(config)
+        begin = REMOVALS_BEGIN_FROM_MODEL if is_enough else REMOVALS_BEGIN
         count = self.options.removals
         last = config.iterations - config.batch  # the last step changes nothing
-        self.removals = [min(last, round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count)))
-                         for i in range(count)]
+        self.removals = [min(last, round(until * (begin + (REMOVALS_END - begin) * i / count))) for i in range(count)]
+        self.drops_unneeded = is_enough and DROPS_UNNEEDED
         interval = max(1, round(MOVE_INTERVAL * until))
         self.moves_end = round(MOVES_END * until)
         self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
@@ -75,20 +96,14 @@ class ImportanceStrategy(SteadyStrategy):
         self._check_reach()
 
     def _check_reach(self) -> None:
-        """Raises ConfigError if growth cannot lead to the budget: a densification doubles at most."""
+        """Raises ConfigError if growth cannot lead to the budget."""
         config = self.context.config
-        most = self.start * 2**self._densifications(config.densify_from_iter)
+        most = reached_from(config, self.start)
         if most < config.budget:
             raise ConfigError(f"--budget is {config.budget}; it must be at most {most}: that is what {self.start} "
                               "points reach with one densification each --densification-interval "
                               f"{config.densification_interval} between --densify-from-iter "
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
-
-    def _densifications(self, behind: int) -> int:
-        """How many densifications come behind an iteration."""
-        config = self.context.config
-        return sum(is_due(iteration, config.densification_interval, config.batch)
-                   for iteration in range(config.batch, self.growth_ends, config.batch) if iteration > behind)
 
     def _find_free_space(self) -> None:
         """Around each training camera is a ball in which nothing can be, as the points of the scene begin behind it."""
@@ -126,7 +141,9 @@ class ImportanceStrategy(SteadyStrategy):
             self._add(view, look)
 
     def after_step(self, step: Step) -> None:
-        if any(map(step.reaches, self.removals)):
+        if self.drops_unneeded and step.reaches(self.context.config.batch):
+            self.drop_unneeded()
+        elif any(map(step.reaches, self.removals)):
             self.remove(1 + sum(later > step.iteration for later in self.removals))
         elif any(map(step.reaches, self.moves)):
             self.move()
@@ -150,13 +167,15 @@ class ImportanceStrategy(SteadyStrategy):
     def growth(self, iteration: int) -> Tuple[int, Optional[int]]:
         """At least what reaches the budget and at most what reaches the overshoot, in equal steps."""
         config, now = self.context.config, self.context.num_gaussians
-        steps = 1 + self._densifications(iteration)
+        steps = 1 + _densifications(config, iteration)
         least = -(-max(0, config.budget - now) // steps)
         if self.options.overshoot == 0:
             return least, None
         return least, -(-max(0, self.overshoot() - now) // steps)
 
     def most(self) -> int:
+        if self.growth_ends == 0:
+            return self.start
         return 0 if self.options.overshoot == 0 else self.overshoot()
 
     def overshoot(self) -> int:
@@ -166,16 +185,27 @@ class ImportanceStrategy(SteadyStrategy):
         return max(min(wanted, max(2 * budget, MOST_OVERSHOOT)), 2 * self.start)
 
     def remove(self, steps_left: int) -> None:
-        """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one.
-
-        First go those that float in front of a camera, then those that few views need.
-        """
-        now, budget, shards = self.context.num_gaussians, self.context.config.budget, self.context.shards
+        """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one."""
+        now, budget = self.context.num_gaussians, self.context.config.budget
         if now <= budget:
             return
         ratio = now / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
         self._look_at_the_rest()
+        self._keep(kept)
+
+    def drop_unneeded(self) -> None:
+        """Removes what no view that a decision looks at needs, as far as the budget allows."""
+        self._look_at_the_rest()
+        needed = self.context.shards.every(self.needed)
+        self._keep(max(self.context.config.budget, int((needed > 0).sum())))
+
+    def _keep(self, kept: int) -> None:
+        """Removes all but so many.
+
+        First go those that float in front of a camera, then those that few views need.
+        """
+        now, shards = self.context.num_gaussians, self.context.shards
         scores = torch.where(self.is_of_few(), -1 / self.costs, self.costs).masked_fill(self.is_near(), -math.inf)
         best = shards.decide(lambda every: torch.topk(every, kept).indices, scores)
         mask = torch.zeros(now, dtype=torch.bool, device=scores.device)

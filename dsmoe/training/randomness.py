@@ -19,26 +19,29 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def random_state() -> Dict[str, Any]:
-    """The states of all generators, as tensors and plain values."""
+def random_state(device: str) -> Dict[str, Any]:
+    """The states of all generators of a training on the device, as tensors and plain values.
+
+    Of the process's own GPU alone: a run may go on where there are fewer.
+    """
     name, keys, position, has_gauss, gauss = np.random.get_state()
     return {
         "python": random.getstate(),
         "numpy": (name, keys.tolist(), position, has_gauss, gauss),
         "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "cuda": [] if device == "cpu" else [torch.cuda.get_rng_state()],
     }
 
 
-def restore_random_state(state: Dict[str, Any]) -> None:
-    """Takes what `random_state` gave."""
+def restore_random_state(state: Dict[str, Any], device: str) -> None:
+    """Takes what `random_state` gave, of several GPUs the first."""
     version, numbers, gauss = state["python"]
     random.setstate((version, tuple(numbers), gauss))
     name, keys, position, has_gauss, gauss = state["numpy"]
     np.random.set_state((name, np.array(keys, np.uint32), position, has_gauss, gauss))
     torch.set_rng_state(state["torch"].cpu())
-    if state["cuda"] and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all([tensor.cpu() for tensor in state["cuda"]])
+    if state["cuda"] and device != "cpu":
+        torch.cuda.set_rng_state(state["cuda"][0].cpu())
 
 
 class ViewOrder:

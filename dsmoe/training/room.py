@@ -8,7 +8,8 @@ from .graphs import PIXEL_BYTES
 
 # Numbers of memory that a Gaussian takes at the peak: for each of its parameters that one, its gradient, two moments of
 # Adam, and what a densification copies. Others are activations, places on the image, statistics and tile lists. By
-# benchmarks/RESULTS.md 1.2 to 3.0 million Gaussians of degree 3 add 1,431 B each (bonsai, alpha) and 1,517 B (smoe).
+# benchmarks/results/tails_h100.jsonl and near_*.jsonl, from 1.2 to 3.0 million Gaussians of degree 3 each adds 1,431 B
+# (bonsai, alpha) and 1,516 B (smoe).
 FOR_EACH_PARAMETER, OTHERS = 5, 65
 # For each further view of a batch its rows, gradients by these and by places: 64 B if half of the Gaussians are seen.
 OF_A_FURTHER_VIEW = 16

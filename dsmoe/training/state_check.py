@@ -72,9 +72,10 @@ def check_state(state: Dict[str, Any], config: TrainConfig, strategy: Dict[str, 
     kind, keys, position, has_gauss, gauss = state["random"]["numpy"]
     np.random.RandomState().set_state((kind, np.array(keys, np.uint32), position, has_gauss, gauss))
     torch.Generator().set_state(state["random"]["torch"].cpu())
-    for generator in state["random"]["cuda"]:
-        _require(isinstance(generator, torch.Tensor) and generator.dtype == torch.uint8, "random/cuda", generator,
-                 "tensors of uint8")
+    for generator in state["random"]["cuda"][:1]:
+        _require(isinstance(generator, torch.Tensor), "random/cuda", type(generator).__name__, "a tensor")
+        if config.device != "cpu":
+            torch.Generator(config.device).set_state(generator.cpu())
 
     _require(isinstance(state["history"], list) and all(isinstance(row, dict) for row in state["history"]), "history",
              state["history"], "a list of evaluations")

@@ -1,7 +1,7 @@
 """A training run over a loaded scene: its state, and one step after the other."""
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, List, Optional, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
@@ -11,8 +11,9 @@ from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
 from ..model import GaussianModel
 from ..optimizer import GaussianOptimizer
-from ..results.evaluation import Evaluation, evaluate
-from ..results.metrics import psnr
+from ..results.evaluation import PASSES, Evaluation, Measure, evaluate, psnr_alone
+from ..results.metrics import image_metrics, psnr
+from ..results.modelfile import raw_of
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..scenes.images import View
 from ..scenes.scene import Scene, difference_of, scene_fingerprint
@@ -29,6 +30,13 @@ from .strategies import STRATEGIES
 from .strategy import Step, StrategyContext, ViewStep, is_due
 
 
+def first_model(config: TrainConfig, scene: Scene) -> GaussianModel:
+    """The Gaussians that a training begins with: round ones at the scene's points, or those of a model."""
+    if scene.start is None:
+        return GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+    return GaussianModel.from_gaussians(raw_of(scene.start.gaussians, config.device), config.sh_degree)
+
+
 class Trainer:
     """A training run over a loaded scene; `step` is one iteration of 3DGS, or several over a batch of views."""
 
@@ -39,7 +47,7 @@ class Trainer:
         seed_everything(config.seed)
         self.config = config
         self.scene = scene.to(config.device)
-        self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+        self.model = first_model(config, scene)
         self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
         self.shards = self._make_shards()
         background = background_color(config.white_background, config.device)
@@ -48,7 +56,7 @@ class Trainer:
         self.renderer = Renderer(
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),
-            deterministic=config.deterministic)
+            faint_below=config.faint_below, deterministic=config.deterministic)
         self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
             lambda views: self.passes.look(views), self.shards))
@@ -195,7 +203,14 @@ class Trainer:
 
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views."""
-        return evaluate(self.result(), self.scene.test, self.config.device, progress)
+        return self._evaluate(self.scene.test, progress, image_metrics, PASSES)
+
+    def evaluate_training_views(self, progress: bool = False) -> Optional[float]:
+        """Their mean PSNR. Where it rises and that of the test views does not, a longer training only overfits."""
+        return self._evaluate(self.scene.train, progress, psnr_alone, 1).metrics["psnr"]
+
+    def _evaluate(self, views: Sequence[View], progress: bool, measure: Measure, passes: int) -> Evaluation:
+        return evaluate(self.result(), views, self.config.device, progress, measure, passes)
 
     def state_dict(self) -> Dict[str, Any]:
         """Everything the rest of the run depends on, as tensors and plain values."""
@@ -211,7 +226,7 @@ class Trainer:
             "gate": self.gate.state_dict() if self.gate else None,
             "average": dict(self.optimizer.average),
             "order": self.order.state_dict(),
-            "random": random_state(),
+            "random": random_state(self.config.device),
         }
 
     def check_state(self, state: Dict[str, Any]) -> None:
@@ -236,4 +251,4 @@ class Trainer:
         if self.gate:
             self.gate.load_state_dict(state["gate"])
         self.order.load_state_dict(state["order"])
-        restore_random_state(state["random"])
+        restore_random_state(state["random"], self.config.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import math
+import re
 import socket
 from typing import Any, Callable, Iterator, Optional
 
@@ -36,9 +37,9 @@ def refusal(origin: Optional[str], host: Optional[str], served_at: str) -> Optio
 
 
 def _host_name(host: str) -> str:
-    """Without the port."""
-    name = host.lower()
-    return name[1:].partition("]")[0] if name.startswith("[") else name.partition(":")[0]
+    """Without the port; "" of a text that is no host, such as `[::1]evil.example`."""
+    found = re.fullmatch(r"(?:\[([\da-f:.%]+)\]|([^\[\]:]*))(?::\d*)?", host.lower(), re.ASCII)
+    return (found[1] or found[2] or "") if found else ""
 
 
 def _is_address(name: str) -> bool:

@@ -62,7 +62,8 @@ def picture(renderer: Renderer, camera: Camera, look: Look) -> np.ndarray:
 def _of_blend(renderer: Renderer, camera: Camera, blend: Blend, shown: str) -> np.ndarray:
     gate = blend.background_gate if blend.mode in GATED_MODES else resolve_background_gate(blend.mode, None)
     own = Renderer(renderer.model, blend.mode, renderer.background, renderer.antialiasing, renderer.rasterize,
-                   background_gate=gate)
+                   background_gate=gate,
+                   faint_below=renderer.faint_below if blend.mode == renderer.blend_mode else None)
     if shown == "gates":
         image = own(camera, colors_precomp=own_colours(renderer.model.num_gaussians).to(renderer.background)).color
     elif shown == "largest gate":

@@ -154,10 +154,10 @@ TEST(Lens, RefusesWhatIsNone) {
        "lens_of: distortion has 3 numbers; it must have 0, 1, 2, 4, 5, 8 or 12: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 "
        "(camera_model opencv)"},
       {calibration(LensModel::kThinPrismFisheye, {1, 2, 3, 4}),
-       "lens_of: distortion has 4 numbers; it must have 8: k1 k2 p1 p2 k3 k4 sx1 sy1 (camera_model "
+       "lens_of: distortion has 4 numbers; it must have 0 or 8: k1 k2 p1 p2 k3 k4 sx1 sy1 (camera_model "
        "thin_prism_fisheye)"},
       {calibration(LensModel::kEquirectangular, {1}),
-       "lens_of: distortion has 1 numbers; it must have none (camera_model equirectangular)"},
+       "lens_of: distortion has 1 numbers; it must have 0 (camera_model equirectangular)"},
       {calibration(LensModel::kFisheye, {0, nan, 0, 0}),
        "lens_of: distortion[1] is nan; it must be finite (camera_model fisheye)"},
       {with([](auto& of) { of.fx = 0; }),

@@ -65,6 +65,22 @@ def test_colour_alone_is_rasterize_bit_for_bit(device, dc_apart):
         assert (gradients[name][~seen] == OLD).all(), name
 
 
+def test_what_needs_arguments_says_so_once_they_are_forgotten(device):
+    """And what needs a rendering, before there is one."""
+    scene = random_scene("alpha", 50)
+    direct = DirectRendering(settings=scene.settings, **scene.inputs)
+    with pytest.raises(RuntimeError, match="DirectRendering.room: nothing is rendered yet; call render first"):
+        direct.room  # noqa: B018
+    color = direct.render().color
+    assert direct.room >= 0
+    direct.forget_gaussians()
+    for name, arguments in (("visible_radii", ()), ("render", ()), ("backward", ({"color": color}, {}))):
+        words = f"DirectRendering.{name}: forget_gaussians has let go of the arguments; call {name} before it"
+        with pytest.raises(RuntimeError, match=words):
+            getattr(direct, name)(*arguments)
+    assert direct.splats().depths.shape == (50,)
+
+
 def test_only_what_is_asked_for_is_computed(device):
     scene = random_scene("alpha", 50)
     direct = DirectRendering(settings=scene.settings, **scene.inputs)

@@ -412,10 +412,14 @@ def names_of_ops():
 @on_every_device
 @pytest.mark.parametrize("op", names_of_ops())
 def test_every_op_refuses_tensors_of_several_devices(op, device):
-    """Each tensor in turn lies elsewhere; so does each of a list. By its like on `meta` torch calls the fake op."""
+    """Each tensor in turn lies elsewhere; so does each of a list. By its like on `meta` torch calls the fake op.
+
+    The device's own op is then called all the same: on a GPU torch calls it if one of the others is on the CPU.
+    """
     function, arguments = getattr(torch.ops.diff_smoe_rasterization, op), every_call()[op]
     function(*arguments.values())
     moved = 0
+    own = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, device.type.upper()))
     for name, value in arguments.items():
         tensors = value if isinstance(value, list) else [value]
         for index, tensor in enumerate(tensors):
@@ -429,8 +433,86 @@ def test_every_op_refuses_tensors_of_several_devices(op, device):
                     continue  # it is the only one
                 with pytest.raises((TypeError, NotImplementedError), match=rf"{op}|markVisible|meta|Meta"):
                     function(*given.values())
+                if other == "meta":
+                    with pytest.raises(TypeError, match=rf"({op}|markVisible): .* is on .*; it must be on .*, as "):
+                        function.default.redispatch(own, *given.values())
                 moved += 1
     assert moved > 0 or op == "mean_squared_neighbour_distances"
+
+
+def moved_by_one(value):
+    """Returns the tensors of an argument at places that are multiples of one number, and of no vector."""
+    if isinstance(value, list):
+        return [moved_by_one(each) for each in value]
+    if not isinstance(value, torch.Tensor) or not value.is_contiguous():
+        return value
+    memory = value.new_empty(value.numel() + 1)[1:]
+    return memory.copy_(value.reshape(-1)).view(value.shape)
+
+
+def as_double(value):
+    if isinstance(value, list):
+        return [as_double(each) for each in value]
+    return value.double() if isinstance(value, torch.Tensor) and value.dtype == torch.float32 else value
+
+
+def flat(values):
+    """Returns the tensors among results or arguments, lists of tensors too."""
+    for value in values if isinstance(values, (tuple, list)) else [values]:
+        yield from flat(value) if isinstance(value, (tuple, list)) else [value] * isinstance(value, torch.Tensor)
+
+
+def written(op, results):
+    """Returns what an op writes of its results: some have rows that mean nothing."""
+    if op in ("rasterize", "blend"):
+        return results[:-1]
+    if op == "project":
+        return [each[results[2] > 0] for each in results]
+    return results[1:] if op == "project_rows_backward" else results
+
+
+@on_every_device
+@pytest.mark.parametrize("op", names_of_ops())
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_every_op_takes_tensors_wherever_they_lie(op, dtype, device):
+    """As a hook of `saved_tensors_hooks`, or a slice, hands them over: a kernel loads vectors where they begin."""
+    if dtype == torch.float64 and op.endswith(("_rows", "rows_backward")) and op != "gather_rows":
+        pytest.skip("of float32 alone")
+    function, calls = getattr(torch.ops.diff_smoe_rasterization, op), []
+    for move in (lambda value: value, moved_by_one):
+        arguments = every_call()[op]
+        if dtype == torch.float64:
+            arguments = {name: as_double(value) for name, value in arguments.items()}
+        calls.append({name: move(value) for name, value in arguments.items()})
+    results = [function(*calls[0].values())]
+    try:
+        results.append(function(*calls[1].values()))
+    except ValueError as error:  # what is written where it lies cannot be copied
+        assert op in ("gaussian_adam", "project_rows", "project_rows_backward") and "must begin at a" in str(error)
+        return
+    results = [written(op, each) for each in results]
+    for one, other in zip(flat([*results[:1], *calls[0].values()]), flat([*results[1:], *calls[1].values()])):
+        if device.type == "cpu" or not one.is_floating_point():
+            assert torch.equal(one.nan_to_num(), other.nan_to_num())
+        else:  # sums are added in any order
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5, equal_nan=True)
+
+
+@on_every_device
+@with_gate
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_saved_tensors_may_come_back_at_another_place(mode, dtype):
+    scene = random_scene(mode, 20, 20, 18, degree=1, dtype=dtype).requiring_grad()
+
+    def gradients():
+        images = rasterize(settings=scene.settings, outputs=OUTPUTS, **scene.inputs)
+        leaves = scene.leaves()
+        return dict(zip(leaves, torch.autograd.grad(images.color.square().sum() + images.depth.sum(),
+                                                    list(leaves.values()))))
+
+    expected = gradients()
+    with torch.autograd.graph.saved_tensors_hooks(moved_by_one, lambda tensor: tensor):
+        assert_same_gradients(gradients(), expected, 1e-5)
 
 
 @on_every_device

@@ -47,6 +47,20 @@ def test_the_halves_give_the_bits_of_the_whole(mode, case):
     assert_equal(actual_gradients, expected_gradients)
 
 
+@pytest.mark.parametrize("blend_mode", ["smoe", "smoe_eq7"])
+@pytest.mark.parametrize("as_tensor", [False, True])
+def test_whether_footprints_depend_on_the_gate(blend_mode, as_tensor):
+    """In `smoe_eq7` alone: so there both halves must be given the same, as `project_gaussians` says."""
+    scene = random_scene("smoe_eq7", opacity=(0.05, 0.9))
+    gates = [torch.tensor(gate, dtype=torch.float64) if as_tensor else gate for gate in (0.01, 0.9)]
+    first, second = (scene.settings._replace(blend_mode=blend_mode, background_gate=gate) for gate in gates)
+    expected = rasterize(settings=second, **scene.inputs).color
+    assert torch.equal(in_halves(settings=second, **scene.inputs).color, expected)
+    mixed = blend_footprints(project_gaussians(settings=first, **scene.inputs), second).color
+    assert torch.equal(mixed, expected) == (blend_mode == "smoe")
+    assert "smoe_eq7" in project_gaussians.__doc__ and "smoe_eq7" in blend_footprints.__doc__
+
+
 def test_the_halves_of_no_gaussians_are_the_background():
     scene = random_scene("smoe", 10).rows(slice(0, 0)).requiring_grad()
     rendering = in_halves(settings=scene.settings, **scene.inputs)

@@ -454,3 +454,14 @@ def test_no_module_of_the_rasterizer_names_another_package():
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 imported.add(node.module.partition(".")[0])
     assert imported - sys.stdlib_module_names == {"torch", "numpy", "diff_smoe_rasterization"}
+
+
+def test_an_environment_that_is_too_old_is_told_before_anything_is_fetched():
+    spec = importlib.util.spec_from_file_location("backend", ROOT / "build_support" / "backend.py")
+    backend = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(backend)
+    for python, release in (((3, 8), "1.13.0a0"), ((3, 12), "2.11.0+cu130"), ((3, 11), None)):
+        backend.refuse_too_old(python, release)
+    for python, release, reason in (((3, 7), None, "this is Python 3.7"), ((3, 8), "1.12.1+cu116", "PyTorch 1.12.1")):
+        with pytest.raises(SystemExit, match=f"Python 3.8 and PyTorch 1.13.*{re.escape(reason)}.*docs/trainers.md"):
+            backend.refuse_too_old(python, release)

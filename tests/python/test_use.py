@@ -16,12 +16,15 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import (
     DirectRendering,
     Footprints,
+    GaussianRasterizer,
     blend_footprints,
+    distCUDA2,
     fused_ssim,
     project_gaussians,
     rasterize,
     rasterize_with_splats,
     reference,
+    visible_radii,
 )
 from diff_smoe_rasterization.autograd import _FirstDerivatives
 from diff_smoe_rasterization.gaussians import activate
@@ -236,18 +239,26 @@ def test_torch_func_is_refused():
     def with_means(function):
         return lambda means: function(settings=scene.settings, **{**scene.inputs, "means3D": means})
 
-    means = scene.inputs["means3D"]
+    means, shape = scene.inputs["means3D"], {name: scene.inputs[name] for name in ("scales", "rotations")}
+    splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
     functions = {
         "rasterize": (with_means(lambda **inputs: rasterize(**inputs).color.sum()), means),
         "project_gaussians": (with_means(lambda **inputs: project_gaussians(**inputs).features.sum()), means),
         "DirectRendering": (with_means(lambda **inputs: DirectRendering(**inputs).render().color.sum()), means),
         "activate": (lambda scales: activate(torch.ones(20, 1), scales, scene.inputs["rotations"])[1].sum(),
                      scene.inputs["scales"]),
+        "visible_radii": (lambda means: visible_radii(means, scene.settings, **shape).sum().float(), means),
+        "markVisible": (lambda means: GaussianRasterizer(scene.settings).markVisible(means).sum().float(), means),
+        "distCUDA2": (lambda means: distCUDA2(means).sum(), means),
+        "contributions": (lambda weights: splats.contributions(weights).pixel_weights.sum(), torch.ones(18, 20)),
+        "importance": (lambda weights: splats.importance(weights).shares.sum(), torch.ones(18, 20)),
         "SSIM and the image loss": (lambda one: l1_ssim_loss(one, image), image)}
     for name, (function, value) in functions.items():
         for transformed, argument in ((torch.func.grad(function), value), (torch.vmap(function), value[None])):
             with pytest.raises(NotImplementedError, match=rf"{name}: torch.func \(grad, .* is not implemented; take"):
                 transformed(argument)
+        with pytest.raises(NotImplementedError, match=f"{name}: (forward-mode|torch.func).* not implemented"):
+            torch.func.jvp(function, (value,), (value,))
 
 
 def test_forward_mode_is_refused():

@@ -16,7 +16,12 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import numpy as np
 import torch
 
-from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, GATED_MODES
+from diff_smoe_rasterization.settings import (
+    BACKGROUND_GATE_VARIABLE,
+    BLEND_MODE_VARIABLE,
+    FAINT_BELOW_VARIABLE,
+    GATED_MODES,
+)
 
 from ...config import LEARNED, TrainConfig
 from ...patches.runtime import STAND_INS
@@ -143,7 +148,10 @@ class ThreeDGS:
         stand_ins = [str(STAND_INS)] * (self.method["variant"] != "unpatched")
         path = [item for item in [*self.method["pythonpath"], *ours, *stand_ins] if item]
         environment = {name: value for name, value in os.environ.items()
-                       if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, "PYTHONSAFEPATH")}
+                       if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, FAINT_BELOW_VARIABLE,
+                                       "PYTHONSAFEPATH")}
+        if self.config.faint_below is not None:
+            environment[FAINT_BELOW_VARIABLE] = str(self.config.faint_below)
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
@@ -184,6 +192,16 @@ class C3DGS(ThreeDGS):
     def own_bytes(self) -> int:
         folder = os.path.join(self.model, "point_cloud")
         return sum(size_of(os.path.join(folder, name, self.container)) for name in os.listdir(folder))
+
+
+class Compact3DGS(ThreeDGS):
+    """Compact-3DGS (Lee et al. 2024): the model is quantised, and its colours are those of a hash grid."""
+
+    container = "point_cloud_pp.npz"
+    of_gaussians = False
+
+    def train_arguments(self) -> List[str]:
+        return [*super().train_arguments(), "--comp", "--store_npz"]
 
 
 class InOneProcess(ThreeDGS):
@@ -228,7 +246,8 @@ class DBS(InOneProcess):
 
 
 SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDGS, "taming": Taming, "2dgs": TwoDGS,
-                                     "dbs": DBS, "c3dgs": C3DGS, "hac": HAC, "hac-plus": HAC}
+                                     "dbs": DBS, "c3dgs": C3DGS, "compact-3dgs": Compact3DGS, "hac": HAC,
+                                     "hac-plus": HAC}
 
 
 def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:

@@ -1,4 +1,4 @@
-"""Figures: quality against the number of Gaussians and the size, as SVG and PNG."""
+"""Figures: quality, and times, against the number of Gaussians and more, as SVG and PNG."""
 from __future__ import annotations
 
 import itertools
@@ -27,6 +27,7 @@ STYLE = {"text.color": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.c
          "grid.color": GRID, "axes.grid": True, "axes.axisbelow": True, "axes.spines.top": False,
          "axes.spines.right": False, "legend.frameon": False, "font.size": 10, "svg.hashsalt": "dsmoe"}
 AMOUNTS = ("num_gaussians", "size_own_mb", "size_common_mb")
+SPEEDS = ("train_seconds", "fps")
 NARROW = 1.5  # the ratio of the largest x value to the smallest, up to which the axis is plain
 MARK, LARGEST_MARK = 6, 12  # points
 PANEL = (4.2, 2.9)  # inches, as the next two
@@ -44,25 +45,41 @@ def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
     pictures = []
     for scene in sorted({group.scene for group in groups}):
         shown = [group for group in groups if group.scene == scene and group.rows]
-        name, title = safe_name(f"{suite}-{scene}-rd"), f"{scene}: quality against number of Gaussians and size"
         modes = "; ".join(dict.fromkeys(group.setting.label() for group in shown))
-        path = os.path.join(folder, f"{name}.svg")
-        with plt.rc_context(STYLE):
-            drawn = rate_distortion(shown)
-            if drawn is not None:
-                os.makedirs(folder, exist_ok=True)
-                drawn.savefig(path, metadata={"Date": None})
-                drawn.savefig(os.path.join(folder, f"{name}.png"), dpi=130)
-                plt.close(drawn)
-                pictures.append(Picture(name, title, f"{title} of {modes}; the figures are in the tables", path))
+        for ending, draw, about in (("rd", rate_distortion, "quality against number of Gaussians and size"),
+                                    ("speed", speed, "training time and FPS against number of Gaussians and PSNR")):
+            name, title = safe_name(f"{suite}-{scene}-{ending}"), f"{scene}: {about}"
+            path = os.path.join(folder, f"{name}.svg")
+            with plt.rc_context(STYLE):
+                drawn = draw(shown)
+                if drawn is not None:
+                    os.makedirs(folder, exist_ok=True)
+                    drawn.savefig(path, metadata={"Date": None})
+                    drawn.savefig(os.path.join(folder, f"{name}.png"), dpi=130)
+                    plt.close(drawn)
+                    pictures.append(Picture(name, title, f"{title} of {modes}; the figures are in the tables", path))
     return pictures
 
 
 def rate_distortion(groups: Sequence[Group]):
-    """One panel for each quality figure (rows) and amount (columns) that was measured; a point is a mean over seeds."""
-    qualities = [name for name in ("psnr", "ssim", *lpips_figures(groups))
-                 if any(_drawn(group, name) for group in groups)]
-    amounts = [name for name in AMOUNTS if any(_drawn(group, name) for group in groups)]
+    """Quality figures over amounts; a point is a mean over seeds. None if there is nothing to draw."""
+    return _panels(groups, ("psnr", "ssim", *lpips_figures(groups)), AMOUNTS)
+
+
+def speed(groups: Sequence[Group]):
+    """Training time and FPS, of cells that shared no machine, over the number of Gaussians and over PSNR.
+
+    Only of methods that were run with several numbers of Gaussians.
+    """
+    curves = [group for group in groups if len({other.setting.amount() for other in groups
+                                                if other.setting.series == group.setting.series}) > 2]
+    return _panels(curves, SPEEDS, ("num_gaussians", "psnr"))
+
+
+def _panels(groups: Sequence[Group], ordinates: Sequence[str], abscissae: Sequence[str]):
+    """One panel for each figure (rows) over each other one (columns), of those that were measured."""
+    qualities = [name for name in ordinates if any(_drawn(group, name) for group in groups)]
+    amounts = [name for name in abscissae if any(_drawn(group, name) for group in groups)]
     if not qualities or not amounts:
         return None
     drawn, axes = plt.subplots(len(qualities), len(amounts), squeeze=False, sharey="row", sharex="col",
@@ -81,7 +98,8 @@ def rate_distortion(groups: Sequence[Group]):
         line[0].set_ylabel(column(quality).name + (" (lower is better)" if quality.startswith(LPIPS) else ""))
     for axis, amount in zip(axes[-1], amounts):
         axis.set_xlabel(column(amount).name)
-        _amounts(axis, [group.measured(amount).value for group in groups if _drawn(group, amount)])
+        if amount in AMOUNTS:
+            _amounts(axis, [group.measured(amount).value for group in groups if _drawn(group, amount)])
     legend(drawn, [Line2D([], [], label=series.label(), **look) for series, look in looks.items()])
     return drawn
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Dict, Iterator, List, Optional, Sequence, Set, Tuple
 
 from diff_smoe_rasterization.settings import GATED_MODES
+from diff_smoe_rasterization.settings import PAPER as PAPER_WORD
 
 from ..names import read_json
 from ..rows import Row
@@ -17,7 +18,8 @@ from .tables import OURS, Column, Table, TableRow, column
 PAPER = read_json(Path(__file__).with_name("paper.json"))  # what it prints, and which names of ours stand for its rows
 SOURCE = PAPER["source"] + "."
 END_NAMES = ("sparse", "dense")
-ABLATION = {"smoe": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d"}
+ABLATION = {"smoe_eq7": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d"}  # their cuts are the same
+PAPERS = f"smoe {PAPER_WORD}"  # the program that made the paper's figures
 COMPARED = ("alpha", "smoe")
 SEEDS = "seeds"  # the column that says how many seeds an average over scenes is of
 MOST_PAIRS = 20  # are named in a note
@@ -114,7 +116,7 @@ def table3(groups: Sequence[Group]) -> Table:
 
 def deltas(groups: Sequence[Group], base: str, blend: str) -> Table:
     """A blend against another in equal settings, seed by seed; beside smoe against alpha what the paper prints."""
-    is_papers = (base, blend) == COMPARED
+    is_papers = base == "alpha" and blend in ("smoe", PAPERS)
     differences = ["psnr", "psnr_edge", "ssim", *lpips_figures(groups)]
     ratios = ["num_gaussians", "size_own_mb", "train_seconds", "fps"]
     rows = list(_papers_deltas([*differences, *ratios])) if is_papers else []
@@ -142,7 +144,8 @@ def deltas(groups: Sequence[Group], base: str, blend: str) -> Table:
     if unequal:
         notes.append(f"{base} and {blend} are of different commits in {len(unequal)} "
                      f"{'pair' if len(unequal) == 1 else 'pairs'}: {some(unequal, MOST_PAIRS)}.")
-    return Table("deltas" if is_papers else f"deltas_{blend}_{base}", f"{blend} against {base}, all else equal",
+    name = "deltas" if (base, blend) == COMPARED else f"deltas_{blend}_{base}"
+    return Table(name, f"{blend} against {base}, all else equal",
                  ("scene", "method", "threshold", "seeds"), columns, rows, notes)
 
 

@@ -40,6 +40,18 @@ inline Tensor read_optional(Arguments& arguments) {
   return value;
 }
 
+// What a rendering saved, each array at a multiple of what a kernel loads at once. Torch's own memory is; what a hook
+// of autograd hands back may lie anywhere, and is copied.
+inline Saved read_saved(Arguments& arguments) {
+  constexpr size_t kLargestVector = 32;  // bytes: SegmentPixel<double>
+  auto saved = arguments.read<Saved>();
+  for (Tensor& array : saved) {
+    const bool given = array.defined() && array.numel() > 0;
+    if (given && reinterpret_cast<uintptr_t>(array.data_ptr()) % kLargestVector != 0) array = array.clone();
+  }
+  return saved;
+}
+
 // Calls body(S()) with the type of `like`, as the op `function`.
 template <class Body> void dispatch(const char* function, const Tensor& like, Body body) {
   as_op(function, [&] { dispatch_real(like, body); });
@@ -170,7 +182,7 @@ template <class Backend, bool kSeen> void rasterize_backward(Arguments& argument
   const Images image_gradients = read_image_gradients(arguments);
   const PresentInputs present(arguments);
   const auto image_list = arguments.read<Tensors>();
-  const auto saved = arguments.read<Saved>();
+  const Saved saved = read_saved(arguments);
   const auto options = read_options(arguments);
   const auto wanted_list = arguments.read<std::vector<bool>>();
   const auto written = kSeen ? arguments.read<Tensors>() : Tensors();
@@ -271,7 +283,7 @@ template <class Backend> void blend_backward(Arguments& arguments) {
   const char* function = "blend_backward";
   const Images image_gradients = read_image_gradients(arguments);
   const auto image_list = arguments.read<Tensors>();
-  const auto saved = arguments.read<Saved>();
+  const Saved saved = read_saved(arguments);
   Footprints of;
   for (auto* tensor : {&of.radii, &of.background}) arguments.read(*tensor);
   arguments.read_optional(of.background_gate);
@@ -346,7 +358,7 @@ template <class Backend> void project_backward(Arguments& arguments) {
 template <class Backend> void contributions(Arguments& arguments) {
   const auto pixel_weights = arguments.read<Tensor>();
   const auto radii = arguments.read<Tensor>();
-  const auto saved = arguments.read<Saved>();
+  const Saved saved = read_saved(arguments);
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
   const Expect expect = check_saved("contributions", radii, saved, background_gate, options);
@@ -373,7 +385,7 @@ template <class Backend> void importance(Arguments& arguments) {
   Tensor share_weights, color, gate_sum, background;
   for (auto* image : {&share_weights, &color, &gate_sum, &background}) arguments.read(*image);
   const auto radii = arguments.read<Tensor>();
-  const auto saved = arguments.read<Saved>();
+  const Saved saved = read_saved(arguments);
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
   const Expect expect = check_saved("importance", radii, saved, background_gate, options);
@@ -409,7 +421,7 @@ template <class Backend> void importance(Arguments& arguments) {
 template <class Backend> void gate_map(Arguments& arguments) {
   auto gate_sum = arguments.read<Tensor>();
   const auto radii = arguments.read<Tensor>();
-  const auto saved = arguments.read<Saved>();
+  const Saved saved = read_saved(arguments);
   const Tensor background_gate = read_optional(arguments);
   const auto options = read_options(arguments);
   const Expect expect = check_saved("gate_map", radii, saved, background_gate, options);
@@ -438,25 +450,27 @@ struct BatchArguments {
 
   int64_t num_views() const { return static_cast<int64_t>(images.size()) / kNumbersOfImage; }
 
-  // The batch as the core has it; no rows yet. Tensors that are not dense are copied.
-  template <class Backend> typename Backend::ViewBatch checked_batch(const char* function) {
+  // Checks all tensors, with the cameras that are given twice. Returns their device.
+  Device checked_device(const char* function) {
     DSMOE_CHECK_VALUE(images.size() == kNumbersOfImage * cameras.size() / kTensorsOfCamera && !images.empty() &&
                           cameras.size() % kTensorsOfCamera == 0,
                       function, ": cameras and images have lengths ", cameras.size(), " and ", images.size(),
                       "; they must have ", kTensorsOfCamera, " tensors and ", kNumbersOfImage, " numbers a view");
+    check_arguments(function, inputs, options);
+    const auto type = inputs[kMeans3D].scalar_type();
+    DSMOE_CHECK_TYPE(type == kFloat, function, ": means3D is ", dtype_name(type), "; it must be float32");
+    for (int64_t v = 0; v < num_views(); ++v) {
+      take_view(function, v);
+      check_arguments(function, inputs, options);
+    }
+    return inputs[kMeans3D].device();
+  }
+
+  // The batch as the core has it; no rows yet. Tensors that are not dense are copied.
+  template <class Backend> typename Backend::ViewBatch batch(const char* function) {
     typename Backend::ViewBatch batch;
     for (int64_t v = 0; v < num_views(); ++v) {
-      std::copy_n(cameras.begin() + v * kTensorsOfCamera, kTensorsOfCamera, inputs.begin() + kViewMatrix);
-      const double* image = images.data() + v * kNumbersOfImage;
-      options.image_width = static_cast<int64_t>(image[0]), options.image_height = static_cast<int64_t>(image[1]);
-      options.tanfovx = image[2], options.tanfovy = image[3];
-      options.camera_model = static_cast<int64_t>(image[4]);
-      DSMOE_CHECK_VALUE(image[5] >= 0 && image[5] <= kMostLensNumbers, function, ": images says that a lens has ",
-                        image[5], " numbers; it must have 0 to ", kMostLensNumbers);
-      options.lens.assign(image + 6, image + 6 + static_cast<int>(image[5]));
-      check_arguments(function, inputs, options);
-      const auto type = inputs[kMeans3D].scalar_type();
-      DSMOE_CHECK_TYPE(type == kFloat, function, ": means3D is ", dtype_name(type), "; it must be float32");
+      take_view(function, v);
       inputs = checked<Backend>(function, inputs, options);
       kept.insert(kept.end(), inputs.begin() + kViewMatrix, inputs.begin() + kViewMatrix + kTensorsOfCamera);
       as_op(function, [&] {
@@ -472,7 +486,7 @@ struct BatchArguments {
   template <class Backend>
   typename Backend::ViewBatch with_rows(const char* function, const Tensor& radii, const Tensor& offsets,
                                         const Tensors& features) {
-    auto batch = checked_batch<Backend>(function);
+    auto batch = this->batch<Backend>(function);
     const Expect expect(function, "means3D", inputs[kMeans3D]);
     const int64_t count = num_gaussians(inputs);
     expect.dense("radii", radii, {num_views(), count}, kInt);
@@ -496,6 +510,18 @@ struct BatchArguments {
     }
   }
 
+  // Puts the camera and the image of a view among the arguments.
+  void take_view(const char* function, int64_t v) {
+    std::copy_n(cameras.begin() + v * kTensorsOfCamera, kTensorsOfCamera, inputs.begin() + kViewMatrix);
+    const double* image = images.data() + v * kNumbersOfImage;
+    options.image_width = static_cast<int64_t>(image[0]), options.image_height = static_cast<int64_t>(image[1]);
+    options.tanfovx = image[2], options.tanfovy = image[3];
+    options.camera_model = static_cast<int64_t>(image[4]);
+    DSMOE_CHECK_VALUE(image[5] >= 0 && image[5] <= kMostLensNumbers, function, ": images says that a lens has ",
+                      image[5], " numbers; it must have 0 to ", kMostLensNumbers);
+    options.lens.assign(image + 6, image + 6 + static_cast<int>(image[5]));
+  }
+
   static constexpr size_t kTensorsOfCamera = 3;
   Inputs inputs;
   Options options;
@@ -508,8 +534,8 @@ static_assert(kProjMatrix == kViewMatrix + 1 && kCampos == kViewMatrix + 2, "a c
 template <class Backend> void count_rows(Arguments& arguments) {
   const char* function = "count_rows";
   BatchArguments given(arguments);
-  const typename Backend::Guard guard(given.inputs[kMeans3D].device());
-  auto batch = given.checked_batch<Backend>(function);
+  const typename Backend::Guard guard(given.checked_device(function));
+  auto batch = given.batch<Backend>(function);
   const Tensor& like = given.inputs[kMeans3D];
   const int64_t count = num_gaussians(given.inputs);
   const Tensor radii = empty({given.num_views(), count}, like, kInt);
@@ -524,7 +550,7 @@ template <class Backend> void project_rows(Arguments& arguments) {
   BatchArguments given(arguments);
   const auto radii = arguments.read<Tensor>(), offsets = arguments.read<Tensor>();
   const auto gates = arguments.read<Tensors>(), features = arguments.read<Tensors>();
-  const typename Backend::Guard guard(given.inputs[kMeans3D].device());
+  const typename Backend::Guard guard(given.checked_device(function));
   auto batch = given.with_rows<Backend>(function, radii, offsets, features);
   const Expect expect(function, "means3D", given.inputs[kMeans3D]);
   check_length(function, "gates", gates.size(), batch.views.size());
@@ -542,7 +568,7 @@ template <class Backend> void project_rows_backward(Arguments& arguments) {
   BatchArguments given(arguments);
   const auto radii = arguments.read<Tensor>(), offsets = arguments.read<Tensor>();
   const auto features = arguments.read<Tensors>(), records = arguments.read<Tensors>();
-  const typename Backend::Guard guard(given.inputs[kMeans3D].device());
+  const typename Backend::Guard guard(given.checked_device(function));
   auto batch = given.with_rows<Backend>(function, radii, offsets, features);
   const Tensor& like = given.inputs[kMeans3D];
   const Expect expect(function, "means3D", like);

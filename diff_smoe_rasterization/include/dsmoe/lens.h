@@ -302,7 +302,7 @@ struct LensCalibration {
   double fx = 0, fy = 0;  // focal lengths, pixels; orthographic: pixels by unit of length. Equirectangular: not read
   double cx = 0, cy = 0;  // principal point, pixels; the centre of the first pixel is (0.5, 0.5). Likewise
   // kOpencv: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4, as OpenCV has them: none, 1, 2, 4, 5, 8 or 12.
-  // kFisheye: k1 k2 k3 k4: none, 1, 2 or 4. kThinPrismFisheye: k1 k2 p1 p2 k3 k4 sx1 sy1, as COLMAP has them: 8.
+  // kFisheye: k1 k2 k3 k4: none, 1, 2 or 4. kThinPrismFisheye: k1 k2 p1 p2 k3 k4 sx1 sy1, as COLMAP has them: none or 8.
   std::vector<double> distortion;
 };
 constexpr int kMostDistortion = 12;
@@ -337,11 +337,11 @@ inline Distortion<double> distortion_of(const LensCalibration& of) {
       d = {{at(0), at(1), at(2), at(3)}, {}, {}, {}};
       break;
     case LensModel::kThinPrismFisheye:  // COLMAP multiplies p1 and p2 as OpenCV does
-      check_count(of, {8}, "8: k1 k2 p1 p2 k3 k4 sx1 sy1");
+      check_count(of, {0, 8}, "0 or 8: k1 k2 p1 p2 k3 k4 sx1 sy1");
       d = {{at(0), at(1), at(4), at(5)}, {}, {at(2), at(3)}, {at(6), 0, at(7), 0}};
       break;
     default:
-      check_count(of, {0}, "none");
+      check_count(of, {0}, "0");
   }
   for (size_t i = 0; i < of.distortion.size(); ++i) {
     if (!is_finite(of.distortion[i])) {

@@ -217,6 +217,8 @@ def test_a_checkout_must_have_the_same_split(names, wrong):
     ("3dgs-2023", {"strategies": ["steady"]}, ["--opacity_reset_interval", str(ITERATIONS + 1)], [], {}),
     ("3dgs-2023", {}, ["--blend_mode", "smoe", "--background_gate", "0.0"], [], {}),
     ("3dgs-2023", {"background_gates": [0.3]}, ["--blend_mode", "smoe", "--background_gate", "0.3"], [], {}),
+    ("compact-3dgs", {}, ["--comp", "--store_npz"], [], {}),
+    ("3dgs-2023", {"blend_mode": "paper"}, ["--blend_mode", "smoe", "--background_gate", "0.0"], [], {}),
     ("3dgs-2023", {"blend_mode": "alpha"}, ["--blend_mode", "alpha"], ["--background_gate"], {}),
     ("3dgs-2023", {}, [], ["--opacity_reset_interval", "--opacity_lr"], {}),
     # 0.05, which is our default, is not that of 3DGS of 2024.
@@ -231,6 +233,7 @@ def test_the_protocol_reaches_a_checkout(name, axes, there, absent, recipe, smal
     words = shape.train_arguments()
     assert " ".join(there) in " ".join(words) and not {*absent} & {*words}
     assert ("--antialiasing" in words) == recipe.get("antialiasing", False)
+    assert shape.environment().get("DSMOE_FAINT_BELOW") == ("2.0" if axes.get("blend_mode") == "paper" else None)
     assert shape.rules()["recipe"] == recipe and shape.rules()["scale_recipe"] is False
 
 

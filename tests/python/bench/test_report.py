@@ -127,6 +127,40 @@ def test_each_gate_of_smoe_is_a_blend_of_its_own():
     assert shown(averages, "Mip-NeRF 360 (ours: bonsai) PSNR [dB]", method="native, smoe") == ["21.00"]
 
 
+def test_the_papers_program_is_compared_with_alpha_beside_what_the_paper_prints():
+    paper = {"background_gate": 0.0, "faint_below": 2.0}
+    entries = [row(), smoe(psnr=23.0, **paper), smoe(psnr=22.0)]
+    assert [line.labels[1] for line in table_of(entries, "cells").rows] == ["native, alpha", "native, smoe",
+                                                                           "native, smoe paper"]
+    table = table_of(entries, "deltas_smoe_paper_alpha")
+    assert shown(table, "Δ PSNR [dB]", seeds="1") == ["+3.00"]
+    assert any(line.source == tables.PAPER for line in table.rows)
+
+
+def test_the_ablation_compares_what_takes_the_same_gaussians():
+    entries = [row(blend_mode=mode, threshold=0.0002) for mode in ("smoe", "smoe_eq7", "smoe_tn", "smoe_std")]
+    table = table_of(entries, "table3")
+    assert [line.labels[2].partition(":")[0] for line in table.rows if line.source == tables.OURS] == [
+        "smoe_eq7", "smoe_tn", "smoe_std"]
+    full, *_, classic = (line.cells for line in table.rows if line.source == tables.PAPER)
+    assert full[2].printed == "0.17" and classic[0].printed == "22.328"
+
+
+def test_times_are_drawn_over_the_number_of_gaussians_and_over_psnr():
+    """Of cells that shared no GPU, of curves of three points and more."""
+    entries = [row(threshold=threshold, num_gaussians=number, psnr=psnr, train_seconds=10 * psnr, fps=5000 / psnr)
+               for threshold, number, psnr in ((0.005, 100, 20.0), (0.001, 200, 25.0), (0.0002, 400, 40.0))]
+    entries += [row(method="taming", variant="patched"),
+                smoe(psnr=21.0, threshold=0.0001, machine={"device": "Card X", "cells_per_gpu": 2})]
+    axes = curves.speed(groups_of(entries)).axes
+    assert [axis.get_ylabel() for axis in axes[::2]] == ["train [s]", "FPS"]
+    assert [axis.get_xlabel() for axis in axes[-2:]] == ["#Gaussians", "PSNR [dB]"]
+    assert [axis.containers[0].lines[0].get_xydata().tolist() for axis in axes] == [
+        [[100, 200], [200, 250], [400, 400]], [[20, 200], [25, 250], [40, 400]],
+        [[100, 250], [200, 200], [400, 125]], [[20, 250], [25, 200], [40, 125]]]
+    assert curves.speed(groups_of(entries[:2])) is None
+
+
 def test_renderings_that_equal_the_ground_truth_have_an_infinite_psnr(tmp_path):
     """json has no number for it: some write null, some Infinity."""
     entries = rows.read_rows(write_rows(tmp_path, [row(psnr=None), row(seed=1), smoe(psnr=math.inf),

@@ -13,7 +13,7 @@ from dsmoe import bench
 from dsmoe.bench import engine, schema
 from dsmoe.bench.errors import BenchError
 from dsmoe.bench.expansion import expand, find_suite, load_suite, read_yaml
-from dsmoe.bench.names import AXIS_OF, SHIPPED
+from dsmoe.bench.names import AXIS_OF, SHIPPED, blend_of
 from dsmoe.bench.protocol import config_of
 from dsmoe.bench.schema import THRESHOLDS
 from dsmoe.cli import main
@@ -52,6 +52,40 @@ def test_gates_are_of_smoe_alone(content):
     names = [cell["id"] for cell in cells]
     assert [cell["id"] for cell in expand(content, "").cells] == [names[4], names[2]]
     assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
+
+
+def test_the_papers_program_is_a_word_among_the_blends(content):
+    """smoe, gate 0, all pairs; `smoe` is another blend. A cell that says no faint_below is named as ever."""
+    cells = expand(dict(content, blend_modes=["alpha", "paper", "smoe", "smoe_eq7"], faint_belows=[None, 0.9],
+                        headline={"blend_modes": ["paper"]}, headline_seeds=[7]), "").cells
+    assert [(blend_of(cell), cell["headline"], cell["seed"], config_of(cell).faint_below) for cell in cells] == [
+        ("alpha", False, 0, None), ("smoe paper", True, 0, 2.0), ("smoe", False, 0, None),
+        ("smoe below 0.9", False, 0, 0.9), ("smoe_eq7", False, 0, None), ("smoe_eq7 below 0.9", False, 0, 0.9),
+        ("smoe paper", True, 7, 2.0)]
+    assert config_of(cells[1]).background_gate == 0 and config_of(cells[1]).blend_mode == "smoe"
+    assert {cell["id"] for cell in expand(content, "").cells} <= {cell["id"] for cell in cells}
+    assert len({cell["id"] for cell in cells}) == len(cells)
+    assert [cell["seed"] for cell in engine.chosen(cells, ["blend_mode=paper"])] == [0, 7]
+    assert len(engine.chosen(cells, ["blend_mode=smoe"])) == 2
+
+
+@pytest.mark.parametrize("name", ["table1", "table3", "fig4", "fig5"])
+def test_the_papers_suites_run_by_name_on_scenes_at_hand(name, monkeypatch):
+    """As a trial too, on the CPU, where checkouts cannot follow: the native trainer is chosen."""
+    monkeypatch.setenv("DSMOE_DATA", "/data")
+    for variable in ("DSMOE_TRAINERS", "DSMOE_SCENES"):
+        monkeypatch.delenv(variable, raising=False)
+    suite = load_suite(find_suite(name), device="cpu", iterations=300, scenes="captures", methods=["Native"])
+    assert {cell["scene"]["path"] for cell in suite.cells} == {"/data/bonsai", "/data/fox"}
+    config = config_of(suite.cells[0])
+    assert (config.iterations, config.densify_until_iter, config.device) == (300, 150, "cpu")
+    blends = {blend_of(cell) for cell in suite.cells}
+    assert blends == ({"smoe_eq7", "smoe_tn", "smoe_std", "smoe paper"} if name == "table3" else
+                      {"alpha", "smoe paper", "smoe learned"})
+    with pytest.raises(BenchError, match="--scenes captuers: no such file, and no scenes that are shipped .captures, "):
+        load_suite(find_suite(name), scenes="captuers")
+    with pytest.raises(BenchError, match="--only method=navite: the suite has native"):
+        load_suite(find_suite(name), methods=["navite"])
 
 
 def test_the_axes_of_the_command_line_are_those_of_the_schema():
@@ -103,6 +137,7 @@ def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
     ({"blend_mode": ["alpha"]}, ["blend_mode", "allowed are background_gates, blend_modes"]),
     ({"blend_modes": ["smooth"]}, ["blend_modes[0]", "smooth"]),
     ({"background_gates": [-1]}, ["background_gates[0]", "-1"]),
+    ({"faint_belows": [-1]}, ["faint_belows[0]", "a number of at least 0, or null"]),
     ({"background_gates": ["leanred"]}, ["background_gates[0]", "leanred"]),
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
     ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "less than or equal to 1000000"]),

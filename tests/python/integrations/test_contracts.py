@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -72,6 +73,34 @@ def test_each_module_returns_what_its_contract_says(contract):
     assert found["color"].shape == (3, 10, 20) and found["radii"].shape == (12,)
     for name in {"inverse_depth", "depth", "alpha", "opacity"} & set(found):
         assert found[name].shape == (1, 10, 20)
+
+
+@pytest.mark.parametrize("contract", [one for one in CONTRACTS if one.name != "gsplat"])
+def test_whatever_an_argument_is_the_error_names_it(contract):
+    """Each argument in turn is what it cannot be: an error of torch, from code before `rasterize`, would not say so."""
+    module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract.name}")
+    scene = random_scene("alpha", 12, 20, 10, degree=1)
+    fields = {name: getattr(scene.settings, name) for name in SETTINGS}
+    made = module.GaussianRasterizationSettings(**fields, **{
+        name: None if name == "pixel_weights" else OFTEN_GIVEN.get(name, True) for name in contract.settings})
+    kinds = {name: torch.rand(12, 1, 4).double() for name in contract.arguments
+             if name in ("semantic_feature", "sh_objs", "language_feature_precomp", "mask_precomp")}
+    wrong = [torch.zeros(12).double(), torch.zeros(12, 3, 3, 3).double(), torch.zeros(5, 3).double(),
+             torch.tensor(1.0).double(), torch.zeros(12, 7).double(), "red", 3.5, [1, 2]]
+    names = [name for name in contract.arguments if name not in ("sh_indices", "g_indices", "scale_factors")]
+    for name in names:
+        for value in wrong:
+            inputs = {**scene.inputs, **kinds, name: value}
+            if name == "colors_precomp":
+                del inputs["shs"]
+            try:
+                module.GaussianRasterizer(raster_settings=made)(**inputs)
+            except (TypeError, ValueError, NotImplementedError) as error:
+                if not re.match(r"rasterize(_with_splats)?: \w+ (is|has|are) ", str(error)):
+                    raise
+    for name in ("means3D", "shs", "opacities"):
+        with pytest.raises(TypeError, match=f"rasterize(_with_splats)?: {name} is of type str"):
+            module.GaussianRasterizer(raster_settings=made)(**{**scene.inputs, **kinds, name: "red"})
 
 
 def sums_of_absolute_gradients(scene, weights, **settings):

@@ -460,6 +460,22 @@ def test_what_does_not_fit_is_named(small, name, value, error):
         rasterization(**{**small, name: value})
 
 
+@pytest.mark.parametrize("name", ["width", "height"])
+@pytest.mark.parametrize("size", [0, -3, 4.5, "8", torch.tensor(0)], ids=str)
+def test_a_size_that_no_image_has_is_named(small, name, size):
+    with pytest.raises(ValueError, match=f"rasterization: {name} is .*; it must be a whole number of pixels"):
+        rasterization(**{**small, name: size})
+
+
+@pytest.mark.parametrize("name, value, error", [
+    ("colors", "red", "colors is of type str"), ("means", torch.zeros(12, 3, dtype=torch.int64), "viewmats is"),
+    ("far_plane", "far", "far_plane is of type str"), ("radius_clip", None, "radius_clip is of type NoneType")],
+    ids=["colors", "means", "far_plane", "radius_clip"])
+def test_another_type_is_named(small, name, value, error):
+    with pytest.raises(TypeError, match=f"rasterization: {error}"):
+        rasterization(**{**small, name: value})
+
+
 def test_missing_tensors_are_named(small):
     with pytest.raises(TypeError, match="quats"):
         rasterization(**{**small, "quats": None})

@@ -1,9 +1,14 @@
 """The gate that this process learns: when it steps, what it adds up, and the files that bring it back."""
 from __future__ import annotations
 
+import contextlib
+import json
 import math
+import os
+import re
+import stat
 import struct
-import warnings
+import threading
 
 import numpy as np
 import pytest
@@ -126,6 +131,71 @@ def test_of_several_optimizers_that_of_the_centres_counts(computed):
 
 
 @pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+@pytest.mark.parametrize("others", [1, 2, 3])
+@pytest.mark.parametrize("set_to_none", [True, False])
+def test_centres_that_no_optimizer_holds_wait_for_none(others, set_to_none):
+    """They are a frozen Parameter, and their gradient is never dropped: the gate steps once in each iteration."""
+    view, gaussians = scene()
+    names = ["opacities", "scales", "rotations"][:others]
+    optimizers = [torch.optim.Adam([gaussians[name]], lr=0) for name in names]
+    expected = []
+    for _ in range(4):
+        expected.append(gradient_at(gate.value(), view, gaussians))
+        loss(view, gaussians).backward()
+        for optimizer in optimizers:
+            optimizer.step()
+            assert gate.value() == pytest.approx(by_hand(expected), rel=1e-4), "with the first one"
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=set_to_none)
+    # Once an optimizer takes them, the gate steps with that one.
+    own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+    loss(view, gaussians).backward()
+    own.step()
+    before = gate.value()
+    loss(view, gaussians).backward()
+    optimizers[0].step()
+    assert gate.value() == before
+    own.step()
+    assert gate.value() != before
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+def test_an_optimizer_that_holds_the_centres_and_has_not_stepped_yet_is_waited_for():
+    """From the first iteration on, whichever steps first."""
+    view, gaussians = scene()
+    own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+    others = [torch.optim.Adam([gaussians[name]], lr=0) for name in ("opacities", "scales")]
+    for _ in range(2):  # the second time nothing was dropped: both passes add up
+        loss(view, gaussians).backward()
+        for optimizer in others * 2:
+            optimizer.step()
+        assert gate.value() == pytest.approx(START, rel=1e-6)
+    own.step()
+    assert gate.value() != pytest.approx(START, rel=1e-6)
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+@pytest.mark.parametrize("known", [True, False])
+def test_an_optimizer_that_densification_makes_anew_costs_no_step(known):
+    """With new centres, between the backward pass and the step; another optimizer steps beside it."""
+    view, gaussians = scene()
+    other = torch.optim.Adam([gaussians["opacities"]], lr=0)
+    own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+    steps = 0
+    for iteration in range(4):
+        before = gate.value()
+        loss(view, gaussians).backward()
+        if iteration % 2 == known:
+            gaussians["means3D"] = torch.nn.Parameter(gaussians["means3D"].detach().clone())
+            own = torch.optim.Adam([gaussians["means3D"]], lr=0)
+        for optimizer in (other, own):
+            optimizer.step()
+            optimizer.zero_grad()
+        steps += gate.value() != before
+    assert steps == 4 and gate.state_dict()["adam"]["step"] == 4
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
 def test_densification_between_the_backward_pass_and_the_step_loses_no_step():
     """3DGS puts new centres into its optimizer there; before the first step nothing tells whose they are."""
     view, gaussians = scene()
@@ -237,6 +307,27 @@ def test_a_step_before_the_backward_pass_of_another_rendering_is_no_error():
     waiting.backward()
 
 
+def test_processes_that_each_learn_a_gate_are_told_so(tmp_path):
+    """Once, and only where there are several."""
+    view, gaussians = scene()
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/meeting", rank=0, world_size=1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss(view, gaussians)
+    finally:
+        torch.distributed.destroy_process_group()
+    gate.reset()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.distributed, "is_initialized", lambda: True)
+        patch.setattr(torch.distributed, "get_world_size", lambda: 4)
+        with pytest.warns(UserWarning, match="each of the 4 processes of this training learns a background gate of"):
+            loss(view, gaussians)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss(view, gaussians)
+
+
 def test_without_gradients_of_gaussians_an_image_has_none():
     """A viewer's Gaussians need none, and it calls numpy()."""
     view, gaussians = scene()
@@ -263,23 +354,38 @@ def ply(path):
 
 def read_ply(path):
     import plyfile
-    plyfile.PlyData.read(str(path))
+    return plyfile.PlyData.read(str(path))["vertex"]["x"]
 
 
 KINDS = {".ply": (ply, read_ply),
-         ".npz": (lambda path: np.savez(path, opacity=np.zeros(1)), lambda path: np.load(path)),
-         ".pth": (lambda path: torch.save((torch.zeros(3), 7), path), lambda path: torch.load(path))}
+         ".npz": (lambda path: np.savez(path, opacity=np.zeros(1)), lambda path: np.load(path)["opacity"]),
+         # Of some size: torch cannot read an archive that is shorter than its comment.
+         ".pth": (lambda path: torch.save((torch.zeros(9000), 7), path), lambda path: torch.load(path)[0])}
+
+
+@pytest.fixture
+def process(monkeypatch):
+    """Makes this a process that blends so, as `dsmoe run` does."""
+    def blends(mode, background_gate="learned"):
+        gate.reset()
+        records._told.clear()
+        monkeypatch.setenv("DSMOE_BLEND_MODE", mode)
+        monkeypatch.setenv("DSMOE_BACKGROUND_GATE", str(background_gate))
+
+    records.keep()
+    records._told.clear()
+    return blends
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_model_brings_the_gate_that_it_was_saved_with(kind, tmp_path, monkeypatch):
+def test_a_model_brings_the_gate_that_it_was_saved_with(kind, tmp_path, process, monkeypatch):
     """What it holds besides is what it was; the gate of a later iteration is in the later file."""
     save, load = KINDS[kind]
     path = tmp_path / ("model" + kind)
-    records.keep()
-    monkeypatch.setenv("DSMOE_BLEND_MODE", "alpha")
+    process("alpha")
     save(path)
     plain = path.read_bytes()
+    process("smoe")
     view, gaussians = scene()
     optimizer = torch.optim.SGD(gaussians.values(), lr=0)
     values = []
@@ -288,17 +394,22 @@ def test_a_model_brings_the_gate_that_it_was_saved_with(kind, tmp_path, monkeypa
         optimizer.step()
         optimizer.zero_grad()
         values.append(gate.value())
-        path = tmp_path / f"{step}{kind}"
+        path = tmp_path / str(step) / ("model" + kind)
+        path.parent.mkdir()
         save(path)
-    assert plain != path.read_bytes() and b"background_gate" not in plain
+        assert [one.name for one in path.parent.iterdir()] == [path.name]
+    assert b"background_gate" not in plain and b"background_gate" in path.read_bytes()
+    assert kind == ".ply" or path.read_bytes().startswith(plain[:-2])  # the comment's length follows
     going_on = gate.state_dict()
-    for step, value in enumerate(values):
-        gate.reset(frozen=True)
-        with pytest.raises(RuntimeError, match="no file that was read says which .*as a number, --background_gate V"):
-            image(view, gaussians)
-        load(tmp_path / f"{step}{kind}")
-        assert gate.value() == value
-        assert torch.equal(image(view, gaussians), image(view._replace(background_gate=value), gaussians))
+    for own in "smoe", "":  # without the variable only settings say how a process blends
+        for step, value in enumerate(values):
+            process(own)
+            gate.reset(frozen=True)
+            with pytest.raises(RuntimeError, match="no file that was read says which .*number, --background_gate V"):
+                image(view, gaussians)
+            load(tmp_path / str(step) / ("model" + kind))
+            assert gate.value() == value
+            assert torch.equal(image(view, gaussians), image(view._replace(background_gate=value), gaussians))
     gate.reset()
     load(path)
     assert kind == ".ply" or gate.state_dict() == going_on
@@ -307,23 +418,201 @@ def test_a_model_brings_the_gate_that_it_was_saved_with(kind, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_model_without_a_record_has_0_and_says_so(kind, tmp_path, monkeypatch):
+def test_a_model_without_a_record_counts_as_one_of_alpha(kind, tmp_path, process, capfd):
     save, load = KINDS[kind]
     path = tmp_path / ("model" + kind)
-    records.keep()
+    process("alpha")
     save(path)
-    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")
-    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "learned")
-    with pytest.warns(UserWarning, match="records no background gate, so it is 0 where nothing is learned"):
-        load(path)
+    load(path)
+    np.savez(tmp_path / "points.npz", x=np.zeros(1))
+    assert not capfd.readouterr().err
+    process("smoe_tn")
+    load(path)
+    assert "no blend mode, as a file of alpha, and this process blends by smoe_tn\n" in capfd.readouterr().err
+    process("smoe")
+    load(path)
+    load(path)
+    said = capfd.readouterr().err
+    assert said.count("The gate is 0 where nothing is learned, and learning starts at 0.1;") == 1
     view, gaussians = scene()
     with torch.no_grad():
         assert torch.equal(image(view, gaussians), image(view._replace(background_gate=0.0), gaussians))
-    points = tmp_path / "points.npz"
-    np.savez(points, x=np.zeros(1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        np.load(points)
+    np.load(tmp_path / "points.npz")  # no model
+    assert not capfd.readouterr().err
+
+
+def with_record(kind, path, record):
+    """A model with a record, written by hand: text for a zip's comment, comments for a .ply."""
+    if kind == ".ply":
+        pytest.importorskip("plyfile")
+        lines = "".join(f"comment {name} {value}\n" for name, value in record.items())
+        properties = "".join(f"property float {name}\n" for name in ("x", "opacity", "scale_0", "rot_0"))
+        header = f"ply\nformat ascii 1.0\n{lines}element vertex 1\n{properties}end_header\n0 0 0 0\n"
+        path.write_bytes(header.encode("ascii", "surrogateescape"))
+        return
+    comment = b"diff_smoe_rasterization " + (record if isinstance(record, bytes) else json.dumps(record).encode())
+    plain = path.read_bytes()
+    path.write_bytes(plain[:-2] + struct.pack("<H", len(comment)) + comment)
+
+
+OF_GATE = {"blend_mode": "smoe", "background_gate": 0.25}
+ADAM = {"step": 3, "exp_avg": 0.0, "exp_avg_sq": 0.0}
+DAMAGED = [
+    *({**OF_GATE, "background_gate": value} for value in (math.nan, -1, -0.1, math.inf, 1e31, "0.25", None, True, [1])),
+    *({**OF_GATE, "faint_below": value} for value in (math.nan, -1, "2", [])),
+    *({**OF_GATE, "blend_mode": value} for value in ("smo", None, 3, ["smoe"], {})), {}, [], 3, "smoe", None,
+    b"", b"{", b"\xff\xfe", b"[" * 3000, b"[" * 900 + b"]" * 900, b'{"blend_mode": "smoe", "background_gate": 1e999}',
+    b'{"blend_mode": "smoe", "background_gate": ' + b"9" * 5000 + b"}",
+    *({**OF_GATE, "learned": state} for state in (
+        3, [], {}, "x", {"logarithm": 0.0}, {"logarithm": math.nan, "adam": {}}, {"logarithm": "0", "adam": {}},
+        {"logarithm": 1e9, "adam": {}}, {"logarithm": 0.0, "adam": {"step": 3}}, {"logarithm": 0.0, "adam": [1]},
+        {"logarithm": 0.0, "adam": {**ADAM, "step": -1}}, {"logarithm": 0.0, "adam": {**ADAM, "step": "3"}},
+        {"logarithm": 0.0, "adam": {**ADAM, "exp_avg_sq": -1}}, {"logarithm": 0.0, "adam": {**ADAM, "exp_avg": None}}))]
+
+
+@pytest.mark.parametrize("kind", (".npz", ".pth"))
+def test_a_damaged_record_counts_as_none(kind, tmp_path, process, capfd):
+    """The file itself is whole: what reads it gets it, and no damage is taken for a gate."""
+    path = tmp_path / ("model" + kind)
+    process("alpha")
+    for record in DAMAGED:
+        KINDS[kind][0](path)
+        with_record(kind, path, record)
+        process("smoe")
+        assert KINDS[kind][1](path).shape
+        said = capfd.readouterr().err
+        assert ("record of mode and gate is damaged" in said) == (record is not None), record  # null is no record
+        assert "it records no blend mode, as a file of alpha" in said and gate.value() == 0, record
+        process("alpha")
+
+
+@pytest.mark.parametrize("comments", [
+    {"blend_mode": "smoe", "background_gate": value} for value in ("nan", "-1", "inf", "x", "", "1e31")] + [
+    {"blend_mode": "smo", "background_gate": "0.25"}, {"blend_mode": ""}, {"blend_mode": "smoe smoe"},
+    {"blend_mode": "smoe", "faint_below": "nan"}])
+def test_damaged_comments_of_a_ply_count_as_none(comments, tmp_path, process, capfd):
+    with_record(".ply", tmp_path / "a.ply", comments)
+    process("smoe")
+    assert read_ply(tmp_path / "a.ply").shape == (1,)
+    assert "record of mode and gate is damaged (ValueError: " in capfd.readouterr().err and gate.value() == 0
+
+
+def test_comments_that_are_no_record_are_not_read_as_one(tmp_path, process, capfd):
+    """Of another program, and words of ours in the middle of a file; a .ply that names a mode and no gate has 0."""
+    path = tmp_path / "model.npz"
+    process("alpha")
+    np.savez(path, opacity=np.frombuffer(b'diff_smoe_rasterization {"blend_mode": "smoe_tn"}', np.uint8))
+    plain = path.read_bytes()
+    process("smoe")
+    for text in (b"", b"of another program", b"diff_smoe_rasterization_2 {}"):
+        path.write_bytes(plain[:-2] + struct.pack("<H", len(text)) + text)
+        np.load(path)
+        assert "records no blend mode" in "".join(records._told) and "damaged" not in capfd.readouterr().err
+        records._told.clear()
+    with_record(".ply", tmp_path / "a.ply", {"blend_mode": "smoe"})
+    read_ply(tmp_path / "a.ply")
+    assert capfd.readouterr().err.endswith("a.ply records the background gate 0\n")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("own, record, said", [
+    (("smoe_eq7", 0.0), ("smoe_eq7", 0.3), "of smoe_eq7, background gate 0.3, and this process blends by smoe_eq7, "
+                                           "background gate 0.0; --blend_mode smoe_eq7 --background_gate 0.3 is as"),
+    (("smoe", 0.5), ("smoe", 0.3), "gate 0.3, and this process blends by smoe, background gate 0.5; --blend_mode smoe"),
+    (("smoe_eq7", 0.3), ("smoe", 0.3), "--blend_mode smoe --background_gate 0.3 is as it was"),
+    (("smoe", "learned"), ("smoe_eq7", 0.3), "by smoe, background gate learned, in which its Gaussians show another"),
+    (("alpha", ""), ("smoe", 0.3), "gate 0.3, and this process blends by alpha, in which its Gaussians show another"),
+    (("smoe_tn", ""), ("smoe_std",), "by smoe_tn, in which its Gaussians show another scene; --blend_mode smoe_std is"),
+    (("smoe", 0), ("smoe", 0.0, 2.0), "it is of smoe, background gate 0.0, faint_below 2.0, and this process blends by "
+                                      "smoe, background gate 0.0; DSMOE_FAINT_BELOW=2.0 --blend_mode smoe --back"),
+    (("smoe", 0.3), ("smoe", 0.3), ""), (("smoe_tn", ""), ("smoe_tn",), ""),
+    (("smoe", "learned"), ("smoe", 0.3), "records the background gate 0.3")])
+def test_a_model_of_another_blend_is_named(kind, own, record, said, tmp_path, process, capfd):
+    path = tmp_path / ("model" + kind)
+    process("alpha")
+    if kind != ".ply":
+        KINDS[kind][0](path)
+    with_record(kind, path, dict(zip(("blend_mode", "background_gate", "faint_below"), record)))
+    process(*own)
+    KINDS[kind][1](path)
+    told = capfd.readouterr().err
+    assert said in told and told.count("\n") == bool(said)
+    assert own[1] != "learned" or gate.value() == (0.3 if record[0] == "smoe" else 0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_faint_pairs_of_a_process_are_recorded_and_compared(kind, tmp_path, process, capfd, monkeypatch):
+    """Only where they are unusual, so that other programs' files stay as they are."""
+    path = tmp_path / ("model" + kind)
+    process("smoe", 0.3)
+    KINDS[kind][0](path)
+    assert b"faint_below" not in path.read_bytes()
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "2")
+    KINDS[kind][0](path)
+    KINDS[kind][1](path)
+    assert not capfd.readouterr().err
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "1")
+    KINDS[kind][1](path)
+    assert "faint_below 2.0, and this process blends by smoe, background gate 0.3, faint_below 1.0" in (
+        capfd.readouterr().err)
+
+
+@pytest.mark.parametrize("mode", ["smoe_tn", "smoe_eq7"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mode_without_a_learned_gate_is_recorded_too(kind, mode, tmp_path, process, capfd):
+    process(mode, 0.3)
+    KINDS[kind][0](tmp_path / ("model" + kind))
+    KINDS[kind][1](tmp_path / ("model" + kind))
+    assert not capfd.readouterr().err
+    process("smoe", 0.3)
+    KINDS[kind][1](tmp_path / ("model" + kind))
+    said = capfd.readouterr().err
+    assert re.search(f"it is of {mode}(, background gate 0.3)?, and this process blends by smoe,", said)
+
+
+def test_a_save_that_is_killed_leaves_the_file_of_before(tmp_path, process):
+    """Or a whole one with its record; never one without. What a killed process left goes with the next save."""
+    process("smoe_tn")
+    path, left = tmp_path / "model.pth", tmp_path / ".dsmoe_part-4194305-x"  # no process has that number
+    torch.save((torch.zeros(3), 7), path)
+    before = path.read_bytes()
+
+    class Dies:
+        def __reduce__(self):
+            raise KeyboardInterrupt
+
+    left.mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        torch.save((torch.ones(3), Dies()), path)
+    assert path.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["model.pth"]
+
+
+def test_a_file_is_written_where_and_as_it_would_be_without_a_record(tmp_path, process):
+    """Through a link, with the mode of before, into a pipe, and the errors are those of torch."""
+    process("smoe_tn")
+    real, link, pipe = tmp_path / "real.pth", tmp_path / "link.pth", tmp_path / "pipe"
+    torch.save(torch.zeros(1), real)
+    real.chmod(0o640)
+    link.symlink_to(real.name)
+    torch.save(torch.ones(1), f=link)
+    assert link.is_symlink() and real.stat().st_mode & 0o777 == 0o640 and torch.load(real) == 1
+    assert b"smoe_tn" in real.read_bytes()
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: received.append(pipe.read_bytes()))
+    received = []
+    reader.start()
+    with contextlib.suppress(RuntimeError):  # torch may want to go back in it
+        torch.save(torch.zeros(1), pipe)
+    reader.join()
+    assert received and stat.S_ISFIFO(pipe.stat().st_mode)
+    for wrong in (tmp_path / "none" / "a.pth", tmp_path):
+        with pytest.raises((RuntimeError, OSError)) as with_records:
+            torch.save(torch.zeros(1), wrong)
+        with pytest.raises((RuntimeError, OSError)) as without:
+            torch.save.__wrapped__(torch.zeros(1), wrong)
+        assert str(with_records.value) == str(without.value)
+    with pytest.raises(TypeError, match="save"):
+        torch.save(torch.zeros(1))
 
 
 def test_a_file_with_a_comment_of_another_program_stays(tmp_path):
@@ -333,7 +622,7 @@ def test_a_file_with_a_comment_of_another_program_stays(tmp_path):
     image(view, gaussians)
     torch.save(torch.zeros(1), tmp_path / "old.pth", _use_new_zipfile_serialization=False)
     torch.load(tmp_path / "old.pth")
-    np.savez(tmp_path / "a.npz", x=np.zeros(1))
+    np.savez(tmp_path / "a", x=np.zeros(1))
     saved = (tmp_path / "a.npz").read_bytes()
     length, = struct.unpack("<H", saved[saved.rindex(b"PK\x05\x06") + 20:][:2])
     assert saved[-length:].startswith(b"diff_smoe_rasterization {")

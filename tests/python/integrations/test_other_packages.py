@@ -120,8 +120,40 @@ def test_what_is_not_offered_is_refused():
         scatter(values, index, reduce="mean")
     with pytest.raises(NotImplementedError, match="out"):
         scatter_max(values, index, out=values)
-    with pytest.raises(ValueError, match="index"):
-        scatter(torch.zeros(3, 2, 2), torch.zeros(3, 2, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("shape, axes, dim", [
+    ((6, 5, 3), (6, 5), 0), ((6, 5, 3), (6, 1), 0), ((6, 5, 3), (6, 5), 1), ((6, 5, 3), (1, 5, 1), 1),
+    ((6, 5, 3), (5,), 1), ((6, 5, 3), (5,), -2), ((6, 5, 3), (3,), -1), ((6, 1, 3), (6, 1), 0), ((6,), (6,), -1),
+    ((0, 3), (0,), 0)], ids=str)
+def test_an_index_is_broadcast(shape, axes, dim):
+    """Octree-AnyGS gives one of [N, C] for features [N, C, 3]. Against a loop over the elements."""
+    values, index = random_normal(shape, 3), torch.randint(0, 4, axes)
+    spread = [1] * (dim % len(shape)) + list(axes) if len(axes) == 1 else list(axes)
+    every = index.reshape(spread + [1] * (len(shape) - len(spread))).expand(shape)
+    size = [4 if axis == dim % len(shape) else length for axis, length in enumerate(shape)]
+    sums, largest = torch.zeros(size).double(), torch.full(size, -torch.inf).double()
+    for place in torch.cartesian_prod(*map(torch.arange, shape)).reshape(-1, len(shape)).tolist():
+        to = list(place)
+        to[dim] = int(every[tuple(place)])
+        sums[tuple(to)] += values[tuple(place)]
+        largest[tuple(to)] = max(largest[tuple(to)], values[tuple(place)])
+    torch.testing.assert_close(scatter(values, index, dim, dim_size=4), sums)
+    found, _ = scatter_max(values, index, dim, dim_size=4)
+    assert torch.equal(found, torch.where(largest > -torch.inf, largest, torch.zeros(())))
+
+
+@pytest.mark.parametrize("function", [scatter, scatter_max])
+@pytest.mark.parametrize("index, dim, error, words", [
+    (torch.zeros(3, 2, 2, 1, dtype=torch.int64), 0, ValueError, r"index has shape \[3, 2, 2, 1\]; it must fit src"),
+    (torch.zeros(3, dtype=torch.int64), 1, ValueError, r"index has shape \[3\]; it must fit src, \[3, 2, 2\]"),
+    (torch.zeros(2, 2, dtype=torch.int64), 0, ValueError, r"index has shape \[2, 2\]; it must fit"),
+    (torch.zeros(3), 0, TypeError, "index is torch.float32; it must be torch.int64"),
+    ([0, 0, 0], 0, TypeError, "index is of type list"),
+    (torch.zeros(3, dtype=torch.int64), 3, ValueError, "dim is 3; src has 3 axes")], ids=str)
+def test_an_index_that_does_not_fit_is_named(function, index, dim, error, words):
+    with pytest.raises(error, match=f"{function.__name__}: {words}"):
+        function(torch.zeros(3, 2, 2), index, dim)
 
 
 @pytest.mark.parametrize("at_once", [2 ** 26, 50, 1])

@@ -425,11 +425,11 @@ def test_the_readme_has_every_trainer_rule_and_state():
     text = (Path(__file__).resolve().parents[3] / "dsmoe" / "patches" / "README.md").read_text()
     cells = {line.split(" | ")[0].strip(" |`"): line for line in text.splitlines() if line.startswith("| `")}
     for trainer in TRAINERS:
-        assert f"`{trainer.flavour}`" in cells[trainer.name]
+        assert not trainer.entries or f"`{trainer.name}`" in cells[trainer.flavour].partition(" | ")[2]
         assert {rule.name for rule in rules_of(trainer, {}, False)} <= set(cells)
-        assert all(f"`{rule.function}`" in cells[trainer.name] for rule in trainer.entries)
+        assert all(f"`{rule.function}`" in text for rule in trainer.entries)
     assert all(f"## --{option}\n" in text for option in OPTIONS)
-    assert all(f"`{state}`" in text for state in "unknown unpatchable patchable patched half-patched drifted".split())
+    assert "says patchable, patched, half-patched, drifted, unpatchable or unknown" in text
 
 
 def test_a_folder_of_the_users_stays(tmp_path):

@@ -1,8 +1,10 @@
 """The sources of a patched trainer's blend mode and background gate."""
 from __future__ import annotations
 
+import contextlib
+import io
+import re
 import sys
-import warnings
 from collections import namedtuple
 from types import SimpleNamespace
 
@@ -18,9 +20,18 @@ ALPHA = {"blend_mode": "alpha", "background_gate": None}
 @pytest.fixture(autouse=True)
 def a_process_of_its_own(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py"])
-    runtime._warn.cache_clear()
     runtime.say.cache_clear()
     monkeypatch.setattr(settings, "blend_of_process", None)
+
+
+@contextlib.contextmanager
+def warned(match):
+    """Asserts that stderr has a warning that matches; None: that it has none."""
+    with contextlib.redirect_stderr(io.StringIO()) as stderr:
+        yield stderr
+    assert re.search(f"(?m)^diff_smoe_rasterization: warning: .*{match or ''}", stderr.getvalue()) if match else (
+        "warning" not in stderr.getvalue()), stderr.getvalue()
+    sys.stderr.write(stderr.getvalue())
 
 
 def run(mode, gate="", **more):
@@ -46,8 +57,7 @@ def test_the_blend_of_a_run(mode, variable, monkeypatch):
     own = "learned" if mode == "smoe" else 0.0
     gate = (float(variable) if variable else own) if mode in GATED_MODES else None
     for dataset in (run(mode, white_background=False), run(mode, gate if mode in GATED_MODES else 0.0)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warned(None):
             assert runtime.blend_of(dataset) == {"blend_mode": mode, "background_gate": gate}
         assert (dataset.blend_mode, dataset.background_gate) == (mode, gate)  # what is saved of it
 
@@ -86,8 +96,24 @@ def test_a_wrong_gate_is_refused_by_name(mode, gate, variable, message, monkeypa
 def test_a_model_in_smoe_without_a_gate_has_0_and_says_so(tmp_path):
     (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe')")
     old = SimpleNamespace(blend_mode="smoe", model_path=str(tmp_path))
-    with pytest.warns(UserWarning, match="records no background gate, so it is 0 "):
+    with warned("records no background gate, so it is 0 "):
         assert runtime.blend_of(old) == {"blend_mode": "smoe", "background_gate": 0}
+
+
+def test_the_papers_program_is_a_word_for_three_settings(tmp_path, monkeypatch):
+    """A model's cfg_args records all three. Renderings of the process that name none have them."""
+    typed = run("paper")
+    assert runtime.blend_of(typed) == AUTHORS == {name: getattr(typed, name) for name in AUTHORS}
+    assert settings.resolve_faint_below("smoe", None) == 2
+    ours = model(tmp_path, "Namespace(blend_mode='smoe', background_gate=0.0, faint_below=2.0, eval=True)")
+    assert runtime.saved_blend_of(ours) == AUTHORS
+    runtime.blend_of(run("smoe", "0"))
+    assert settings.resolve_faint_below("smoe", None) == 0.25
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.9")
+    assert runtime.blend_of(run("smoe", "0"))["faint_below"] == settings.resolve_faint_below("smoe", None) == 0.9
+    assert runtime.blend_of(run("alpha")) == ALPHA
+    with pytest.raises(ValueError, match="gate is '0.5'; with the blend mode paper it is 0, or left out"):
+        runtime.blend_of(run("paper", "0.5"))
 
 
 AUTHORS = {"blend_mode": "smoe", "background_gate": 0, "faint_below": 2}  # as the paper's authors' program renders
@@ -101,14 +127,13 @@ def test_the_authors_trainer_blends_by_smoe_with_all_tails_unless_told_otherwise
     assert runtime.default_smoe() == ("smoe_tn", "")
 
 
-def test_a_model_of_the_authors_program_is_smoe_without_a_warning(tmp_path, capsys):
+def test_a_model_of_the_authors_program_is_smoe_without_a_warning(tmp_path):
     """Their cfg_args knows no mode. What the patch records wins, and an alpha model stays one."""
     theirs = model(tmp_path, "Namespace(data_device='cuda', eval=True, images='images', init_path='default', model_path"
                              "='out-temp', resolution=-1, sh_degree=3, source_path='/data/x', white_background=False)")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warned(None) as said:
         assert runtime.saved_smoe_of(theirs) == AUTHORS
-        assert "records no blend mode, so it is smoe with the gate 0" in capsys.readouterr().err
+        assert "records no blend mode, so it is smoe with the gate 0" in said.getvalue()
         ours = model(tmp_path, "Namespace(blend_mode='smoe', background_gate=0.5, init_path='default')")
         assert runtime.saved_smoe_of(ours) == {**AUTHORS, "background_gate": 0.5}
         assert runtime.saved_smoe_of(model(tmp_path, "Namespace(blend_mode='alpha', background_gate=None)")) == ALPHA
@@ -116,11 +141,10 @@ def test_a_model_of_the_authors_program_is_smoe_without_a_warning(tmp_path, caps
 
 @pytest.mark.parametrize("dataset", [SimpleNamespace(), SimpleNamespace(blend_mode=None, background_gate=None)])
 def test_an_old_model_is_alpha_and_says_so_once(dataset):
-    with pytest.warns(UserWarning, match="records no blend mode"):
+    with warned("records no blend mode"):
         assert runtime.blend_of(dataset) == ALPHA
     assert dataset.blend_mode == "alpha"  # what is saved of it says so
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warned(None):
         assert runtime.blend_of(SimpleNamespace(blend_mode="alpha")) == ALPHA
         assert runtime.blend_of(type(dataset)()) == ALPHA
 
@@ -147,17 +171,15 @@ def test_one_line_says_which_mode_it_is(capsys):
 
 def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):
     """A rendering without the flag has the mode of cfg_args; a training, resumed or not, has the default."""
-    with pytest.warns(UserWarning, match="a run with blend_mode smoe, .* has alpha; .*--blend_mode smoe$"):
+    with warned("a run with blend_mode smoe, .* has alpha; .*--blend_mode smoe$"):
         runtime.blend_of(model(tmp_path, "Namespace(sh_degree=3, blend_mode='smoe')"))
     for text in ("Namespace(blend_mode='alpha')", "Namespace(sh_degree=3)", "", "no Python",
                  "Namespace(blend_mode=f())", "__import__('os').mkdir('x')"):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warned(None):
             assert runtime.blend_of(model(tmp_path, text)) == ALPHA
     monkeypatch.chdir(tmp_path)  # of no model yet: the current folder's is another
     (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe')")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warned(None):
         runtime.blend_of(run("alpha", model_path=""))
 
 
@@ -172,16 +194,16 @@ def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch
                                           model_path=str(tmp_path)))
 
     assert rendered() == {"blend_mode": "smoe", "background_gate": 0.5}
-    with pytest.warns(UserWarning, match="is of a run with background_gate 0.5"):
+    with warned("is of a run with background_gate 0.5"):
         assert rendered("--background_gate", "0") == {"blend_mode": "smoe", "background_gate": 0}
-    with pytest.warns(UserWarning, match="is of a run with blend_mode smoe"):
+    with warned("is of a run with blend_mode smoe"):
         assert rendered("--blend_mode", "alpha") == ALPHA
     monkeypatch.setattr(sys, "argv", ["render.py", "--back=2"])  # as argparse takes it too
-    with pytest.warns(UserWarning, match="is of a run with background_gate 0.5"):
+    with warned("is of a run with background_gate 0.5"):
         assert runtime.saved_blend_of(run("alpha", "2", model_path=str(tmp_path)))["background_gate"] == 2
     (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3)")
     monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")
-    with pytest.warns(UserWarning, match="records no blend mode, so it is alpha"):
+    with warned("records no blend mode, so it is alpha"):
         assert rendered() == ALPHA
 
 

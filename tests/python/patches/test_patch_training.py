@@ -44,7 +44,8 @@ class Trained:
         if (kind, mode) not in self.outputs:
             checkout, output = self.checkout(kind), self.folder / f"{kind} {mode}"
             words = ["train.py", "-s", self.scene, "--quiet", "-m", output]
-            words = [*RUN, mode, "--", sys.executable, *words] if kind == "plain" else [*words, "--blend_mode", mode]
+            run = [*RUN[:-1], "--paper"] if mode == "paper" else [*RUN, mode]
+            words = [*run, "--", sys.executable, *words] if kind == "plain" else [*words, "--blend_mode", mode]
             result = self.python(*words, cwd=checkout)
             assert result.status == 0, result.err
             self.outputs[kind, mode] = SimpleNamespace(**vars(result), output=output, model=model(output))
@@ -76,6 +77,13 @@ def test_patched_and_run_train_to_the_same_bits(trained):
     for mode, gate in (("alpha", None), ("smoe", "'learned'")):
         saved = (trained("patched", mode).output / "cfg_args").read_text()
         assert f"blend_mode='{mode}'" in saved and f"background_gate={gate}" in saved
+
+
+def test_the_papers_program_is_one_word_patched_and_under_run(trained):
+    patched, plain = (trained(kind, "paper") for kind in ("patched", "plain"))
+    assert patched.model == plain.model != trained("patched", "smoe").model
+    assert "blend mode smoe, background gate 0.0, faint_below 2" in patched.err and "faint_below 2" in plain.err
+    assert trained.rendered(patched.output) != trained.rendered(patched.output, change=(", faint_below=2.0", ""))
 
 
 def test_render_uses_the_saved_mode_gate_or_the_flag(trained):

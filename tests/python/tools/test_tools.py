@@ -160,10 +160,14 @@ def test_a_view_of_an_orbit(tmp_path):
     assert "--view" in said and not (tmp_path / "no.png").exists()
 
 
-def test_a_model_of_no_known_blend_needs_one(tmp_path):
-    io.write_gaussians(tmp_path / "model.ply", model())
-    said = tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "-o", tmp_path / "out.mp4", status=2)
-    assert "pass --blend" in said and not (tmp_path / "out.mp4").exists()
+def test_a_model_that_records_no_blend_is_alpha_and_says_so(tmp_path):
+    picture = ["--orbit", "--frames", 1, "--size", 32, "--device", "cpu", "-o", tmp_path / "out.png"]
+    said, pictures = [], []
+    for record, more in ((None, []), (None, ["--blend", "alpha"]), ("alpha", [])):
+        io.write_gaussians(tmp_path / "model.ply", model(record))
+        said.append("records no blend, so it is alpha" in tool("dsmoe_render", tmp_path / "model.ply", *picture, *more))
+        pictures.append((tmp_path / "out.png").read_bytes())
+    assert said == [True, False, False] and pictures[0] == pictures[1] == pictures[2]
 
 
 def test_another_blend_than_the_trained_one_is_said(tmp_path):

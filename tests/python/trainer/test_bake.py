@@ -5,9 +5,11 @@ import dataclasses
 import math
 import os
 import re
+import shutil
 import signal
 
 import pytest
+from PIL import Image, ImageOps
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.images import as_float
@@ -151,6 +153,24 @@ def test_an_export_that_is_ended_leaves_nothing(smoe_run, tmp_path, capsys, monk
     assert main(words) == 128 + number and "interrupted" in capsys.readouterr().err
     assert not [*temporary.iterdir(), *output.iterdir()]
     assert signal.getsignal(number) == signal.SIG_DFL
+
+
+def test_a_scene_that_has_changed_since_the_training_is_named(smoe_run, tmp_path, capsys):
+    """The decibels would be those of other photographs; of a lone .ply nobody knows the scene."""
+    changed = tmp_path / "scene"
+    shutil.copytree(smoe_run.scene, changed)
+    image = sorted(changed.rglob("*.png"))[0]
+    with Image.open(image) as photograph:
+        ImageOps.invert(photograph.convert("RGB")).save(image)
+
+    def said(source, scene):
+        words = ["--scene", str(scene), "--bake", "alpha", "--bake-iterations", "1", "--overwrite"]
+        assert main(["export", source, "-o", str(tmp_path / "a.ply"), *words]) == 0
+        return [line for line in capsys.readouterr().err.splitlines() if "scene" in line]
+
+    assert said(smoe_run.output, smoe_run.scene) == said(model_path(smoe_run.output, 250), changed) == []
+    note, = said(smoe_run.output, changed)
+    assert f"note: {changed} is not the scene that {smoe_run.output} was trained on: checksum of the " in note
 
 
 def test_what_cannot_be_baked_is_refused(smoe_run, tmp_path, capsys):

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,11 +20,10 @@ from PIL import Image
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import io
-from dsmoe import inspection
+from dsmoe import cli, inspection
 from dsmoe.cli import main
 from dsmoe.config import TrainConfig
 from dsmoe.config_arguments import GROUPS
-from dsmoe.fast import with_preset
 from dsmoe.results.modelfile import load_model
 from dsmoe.results.rows import viewer_warning
 from dsmoe.scenes.scene import load_scene
@@ -31,7 +31,7 @@ from dsmoe.training import forecast
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
 from dsmoe.training.trainer import Trainer
 
-SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
+SHORT = ["--iterations", "12", "--strategy", "3dgs", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
 GATE = 0.25
 SMOE = ["--blend-mode", "smoe_eq7", "--background-gate", str(GATE), *SHORT]  # how `trained` was
@@ -86,6 +86,22 @@ def test_training_leaves_results_config_and_model(trained):
     assert int(re.search(r"element vertex (\d+)", header).group(1)) == row["num_gaussians"]
 
 
+def test_paper_is_the_program_of_the_authors(scene, tmp_path, capsys):
+    """smoe, gate 0, all pairs; the model's file and the row say so, and it is measured as it was trained."""
+    output, other = str(tmp_path / "paper"), str(tmp_path / "usual")
+    assert main(["train", scene, "-o", output, "--paper", *SHORT]) == 0
+    assert "blend mode smoe (gate 0, all pairs), strategy 3dgs" in capsys.readouterr().out
+    row, = results_of(output)
+    assert (row["blend_mode"], row["background_gate"], row["protocol"]["faint_below"]) == ("smoe", 0, 2)
+    assert load_model(ply_of(output), "cpu")[1] == ("smoe", 0, 2)
+    assert main(["eval", output]) == 0 and results_of(output)[0]["psnr_float"] == row["psnr_float"]
+    assert main(["train", scene, "-o", other, "--blend-mode", "smoe", "--background-gate", "0", *SHORT]) == 0
+    usual, = results_of(other)
+    assert usual["psnr_float"] != row["psnr_float"] and "faint_below" not in usual["protocol"]
+    assert "--blend-mode is 'alpha'; with --paper it is 'smoe', or left out" in fails(
+        capsys, "train", scene, "-o", other, "--paper", "--blend-mode", "alpha")
+
+
 def test_training_says_what_it_loaded_and_what_comes_next(scene, tmp_path, capsys):
     output = str(tmp_path / "out put")
     assert main(["train", scene, "-o", output, "--resolution", "2", "--init-points", "50", *SHORT]) == 0
@@ -116,7 +132,7 @@ def test_a_long_training_on_a_processor_is_told_with_a_shorter_one(scene, monkey
     assert [told(iteration) for iteration in (1, 2, 3)] == [None] * 3
     line = told(4)  # three steps in 25 seconds: 29,996 take 69.4 hours
     assert line.startswith("at this speed the other 29,996 iterations take about 2.9 days, longer as ")
-    assert line.endswith(" --scale-recipe --iterations 2000 --strategy steady --densify-grad-threshold 0.001")
+    assert line.endswith(" For a result in minutes on this CPU add: --overwrite --fast")
     assert told(5) is None, "it is said once"
     assert [forecast.duration(seconds) for seconds in (20, 600, 7200)] == ["20 s", "10 min", "2.0 h"]
 
@@ -136,6 +152,62 @@ def test_help_has_groups_and_a_wrong_mode_is_named_where_it_is_given(scene, caps
     with pytest.raises(SystemExit):
         main(["train", scene, "-o", "out", "--itertions", "5"])
     assert "unrecognized arguments: --itertions 5 (is --iterations meant?)" in capsys.readouterr().err
+
+
+def test_the_whole_command_continues_a_training_of_several_processes(tiny_config, monkeypatch):
+    end = f"train --resume -o {tiny_config.output}"
+    by_torchrun = f"{end} (by torchrun, as before)"
+    for processes, here, device, said in (("1", "1", "cpu", end), ("4", "4", "cuda", f"{end} --gpus 4"),
+                                          ("8", "4", "cuda", by_torchrun), ("2", "2", "cpu", by_torchrun)):
+        tiny_config.changed(device=device).save(tiny_config.output)
+        monkeypatch.setenv("WORLD_SIZE", processes)
+        monkeypatch.setenv("LOCAL_WORLD_SIZE", here)
+        assert cli._resume_command(tiny_config.output).endswith(said)
+
+
+@pytest.mark.parametrize("words, said", [
+    ("train s -o o --steps 5", "--iterations"), ("train s -o o --max_steps=5", "--iterations"),
+    ("train --source_path s --model_path o", "SCENE, --output"), ("train -s s -m o", "SCENE, --output"),
+    ("train s -o o --cap_max 5", "--budget"), ("train s -o o --blend_mode smoe", "--blend-mode"),
+    ("render o -o i --steps 5", ""), ("train s -o o --zzz", "")])
+def test_an_option_of_other_trainers_is_told_by_its_name_here(words, said, capsys):
+    with pytest.raises(SystemExit):
+        main(words.split())
+    assert capsys.readouterr().err.rstrip().endswith(f"(is {said} meant?)") if said else "meant" not in (
+        capsys.readouterr().err)
+
+
+WITHOUT_TORCH = """
+import sys
+from dsmoe.cli import main
+for words in sys.argv[1:]:
+    print(main(words.split("|") if words else []), "torch" in sys.modules, file=sys.stderr)
+"""
+
+
+def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(scene, tmp_path):
+    """Which takes seconds. A command without an action lists what there is."""
+    ply = tmp_path / "a.ply"
+    ply.write_text("")
+    said = {  # what is typed, and what is said of it
+        "train|nowhere|-o|o": "scene nowhere: no such folder", f"train|{ply}|-o|o": "is a file; a scene is a folder",
+        f"train|{scene}|-o|o|--iterations|0": "--iterations is 0; it must be at least 1",
+        f"train|{scene}|-o|o|--paper|--background-gate|1": "with --paper it is 0.0, or left out",
+        "scene|nowhere|-o|o": "no such folder of photographs", "eval|nowhere": "nowhere: no such folder",
+        f"eval|{tmp_path}": "holds no config.json", "render|nowhere|-o|o": "no such file or folder",
+        f"render|{ply}|-o|o": "a .ply holds no cameras", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
+        f"render|{ply}|-o|o|--scene|nowhere": "scene nowhere: no such folder", "view|nowhere": "no such file or folder",
+        "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it"}
+    listed = {"": "measure a trained run again", "patch": "take the patch out of every file",
+              "bench": "run what is not done yet of a suite"}
+    package = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))
+    run = subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *said, *listed], stdout=subprocess.PIPE, cwd=tmp_path,
+                         stderr=subprocess.PIPE, universal_newlines=True, env={**os.environ, "PYTHONPATH": package})
+    parts = re.split(r"(?m)^(\d) (\w+)$\n", run.stderr)
+    texts, statuses, loaded = parts[:-1:3], parts[1::3], parts[2::3]
+    for words, text, expected in zip([*said, *listed], texts, [*said.values(), *listed.values()]):
+        assert expected in text, (words, text)
+    assert statuses == ["1"] * len(said) + ["2"] * len(listed) and set(loaded) == {"False"}, run.stderr
 
 
 @pytest.mark.parametrize("words, error", [
@@ -429,7 +501,7 @@ def test_render_a_ply_with_the_mode_that_it_records(trained, scene, tmp_path):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
 
 
-def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, capsys):
+def test_render_never_changes_the_mode_and_says_where_it_is_not_known(trained, scene, tmp_path, capsys):
     output = str(tmp_path / "images")
     with open(ply_of(trained), "rb") as file:
         content = file.read()
@@ -437,17 +509,20 @@ def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, caps
     gate = f"comment background_gate {GATE}\n".encode()
     assert gate in content
     bare.write_bytes(content.replace(b"comment blend_mode smoe_eq7\n", b"").replace(gate, b""))
-    text = fails(capsys, "render", str(bare), "-o", output, "--scene", scene)
-    assert "bare.ply" in text and "--blend-mode" in text
     text = fails(capsys, "render", ply_of(trained), "-o", output, "--scene", scene, "--blend-mode", "alpha")
     assert "smoe_eq7, not alpha" in text
     text = fails(capsys, "render", trained, "-o", output, "--blend-mode", "alpha")
     assert "smoe_eq7, not alpha" in text
     assert not os.path.exists(output)
     assert main(["render", str(bare), "-o", output, "--scene", scene, "--blend-mode", "alpha"]) == 0
+    assert "records no blend mode" not in capsys.readouterr().err
+    for command in (["render", str(bare), "-o", output + "3", "--scene", scene],
+                    ["export", str(bare), "-o", output + ".html"]):
+        assert main(command) == 0
+        assert f"note: {bare} records no blend mode, so it is alpha" in capsys.readouterr().err
     assert main(["render", trained, "-o", output + "2", "--blend-mode", "smoe_eq7"]) == 0
-    one, other = (open(os.path.join(folder, "view_000.png"), "rb").read() for folder in (output, output + "2"))
-    assert one != other, "the two modes show different images"
+    one, other, third = (open(os.path.join(output + end, "view_000.png"), "rb").read() for end in ("", "2", "3"))
+    assert one == third != other, "the two modes show different images"
 
 
 def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp_path, capsys):
@@ -695,14 +770,15 @@ def ctrl_c_works():
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works, number,
                                                    status):
-    output = str(tmp_path / "out")
+    output = str(tmp_path / "an out")
     arguments = ["train", scene, "-o", output, *SMOE]
     with monkeypatch.context() as patch:
         interrupt_at(patch, 7, number)
         assert main(arguments) == status
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-    assert capsys.readouterr().err.endswith("interrupted; continue it with --resume\n")
-    assert main([*arguments, "--resume"]) == 0
+    typed = capsys.readouterr().err.rpartition("interrupted; continue it with: ")[2]
+    words = shlex.split(typed)
+    assert main(words[words.index("train"):]) == 0
     assert "resumed at iteration 7" in capsys.readouterr().out
     for path in (ply_of, lambda run: os.path.join(run, "loss.png")):
         with open(path(output), "rb") as mine, open(path(trained), "rb") as theirs:
@@ -817,8 +893,8 @@ def test_what_of_an_unfinished_run_cannot_be_looked_at_is_named(trained, tmp_pat
 
 def test_scale_recipe(scene, tmp_path):
     output = str(tmp_path / "out")
-    assert main(["train", scene, "-o", output, "--iterations", "30", "--scale-recipe", "--densify-from-iter", "3",
-                 "--sh-degree-interval", "1000", "--quiet"]) == 0
+    assert main(["train", scene, "-o", output, "--iterations", "30", "--strategy", "3dgs", "--scale-recipe",
+                 "--densify-from-iter", "3", "--sh-degree-interval", "1000", "--quiet"]) == 0
     with open(os.path.join(output, "config.json"), encoding="utf-8") as file:
         config = json.load(file)
     assert (config["densify_until_iter"], config["opacity_reset_interval"], config["densify_from_iter"]) == (15, 3, 3)
@@ -848,35 +924,20 @@ def test_a_budget_without_time_to_settle_is_told(scene, tmp_path, capsys, until,
     assert ("no iterations to settle" in capsys.readouterr().out) is not has_time
 
 
-@pytest.mark.parametrize("words, budget, iterations, until, settings", [
-    (["--iterations", "30"], 90, 30, 10, "overshoot=1.5,removals=4"),
-    (["--iterations", "30", "--budget", "70"], 70, 30, 10, "overshoot=1.5,removals=4"),
-    (["--iterations", "30", "--init-points", "20"], 60, 30, 10, "overshoot=1.5,removals=4"),
-    (["--iterations", "30", "--strategy-options", "views=3,removals=2", "--densify-until-iter", "12"], 90, 30, 12,
-     "views=3,removals=2,overshoot=1.5")])
-@pytest.mark.parametrize("mode", ["alpha", "smoe"])
-def test_fast(scene, tmp_path, monkeypatch, mode, words, budget, iterations, until, settings):
-    """The tiny scene has 144 points: three for each would be 432, more than the bound that is set here."""
-    monkeypatch.setattr("dsmoe.fast.LEAST", 10)
-    monkeypatch.setattr("dsmoe.fast.MOST", 90)
-    output = str(tmp_path / "out")
-    assert main(["train", scene, "-o", output, "--fast", "--blend-mode", mode, *words, "--quiet"]) == 0
-    config, (row,) = TrainConfig.load(output), results_of(output)
-    assert (config.budget, config.iterations, config.densify_until_iter) == (budget, iterations, until)
-    assert config.strategy_options == settings and row["num_gaussians"] == budget
-    assert config.position_lr_max_steps == 30 and config.sh_degree_interval == 1
-    assert main(["train", scene, "--resume", "-o", output, "--fast", "--blend-mode", mode, *words, "--quiet"]) == 0
-
-
-def test_fast_is_of_importance_and_has_defaults(scene, tmp_path, capsys):
-    text = fails(capsys, "train", scene, "-o", str(tmp_path / "out"), "--fast", "--strategy", "mcmc")
-    assert "--strategy is 'mcmc'; it must be left out or importance with --fast" in text
-    options = with_preset({"seed": 3})
-    assert options == {"seed": 3, "iterations": 7000, "densify_until_iter": 2450, "strategy": "importance",
-                       "strategy_options": "overshoot=1.5,removals=4"}
-    with pytest.raises(SystemExit):
-        main(["train", "--resume", str(tmp_path / "out"), "--fast"])
-    assert "--fast needs SCENE" in capsys.readouterr().err
+def test_the_psnr_of_training_views_is_that_of_their_images(scene, trained, tmp_path):
+    output, images = str(tmp_path / "out"), tmp_path / "images"
+    shutil.copytree(trained, output)
+    assert main(["render", output, "-o", str(images), "--split", "train"]) == 0
+    values = []
+    for path in sorted(images.glob("*.png")):
+        shown, photo = (np.asarray(Image.open(file).convert("RGB"), np.float64) / 255
+                        for file in (path, os.path.join(scene, "images", path.name)))
+        values.append(-10 * np.log10(np.square(shown - photo).mean()))
+    assert len(values) == 7
+    row, = results_of(output)
+    assert row["psnr_train"] == pytest.approx(np.mean(values), abs=1e-4)  # of float32 images, which are the same bytes
+    os.remove(os.path.join(output, "results.json"))
+    assert main(["eval", output]) == 0 and results_of(output)[0]["psnr_train"] == row["psnr_train"]
 
 
 def test_info(capsys):

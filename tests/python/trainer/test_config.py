@@ -23,9 +23,10 @@ PUBLISHED = {
 
 
 def parse(*arguments):
+    """With the recipe of 3DGS, which reads no scene, unless another strategy is named."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    return config_from_arguments(parser.parse_args(["scene", "-o", "out", *arguments]))
+    return config_from_arguments(parser.parse_args(["scene", "-o", "out", "--strategy", "3dgs", *arguments]))
 
 
 def test_defaults_are_those_of_3dgs():
@@ -76,6 +77,20 @@ def test_background_gate_of_each_mode(monkeypatch):
 def test_a_background_gate_that_the_mode_does_not_know_is_refused(mode, gate, words):
     with pytest.raises(ConfigError, match=words):
         TrainConfig(blend_mode=mode, background_gate=gate)
+
+
+def test_faint_below_is_of_the_gated_modes(monkeypatch):
+    assert parse("--blend-mode", "smoe").faint_below is None, "the mode's own"
+    assert parse("--blend-mode", "smoe_eq7", "--faint-below", "0.9").faint_below == 0.9
+    with pytest.raises(ConfigError, match="--faint-below is 0.9, but the blend mode is alpha; only smoe and smoe_eq7"):
+        parse("--faint-below", "0.9")
+    with pytest.raises(ConfigError, match="faint_below is -1.0; it must be a number, 0 or more"):
+        parse("--blend-mode", "smoe", "--faint-below", "-1")
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.5")
+    assert (parse("--blend-mode", "smoe").faint_below, parse().faint_below) == (0.5, None)
+    given = parse("--blend-mode", "smoe", "--faint-below", "2")
+    assert given.faint_below == given.changed(seed=1).faint_below == 2 and given.changed(
+        blend_mode="alpha").faint_below is None
 
 
 def test_another_mode_takes_its_own_background_gate():

@@ -60,12 +60,11 @@ def test_a_build_that_is_to_come_counts_as_one_for_the_gpu_that_torch_sees(machi
 
 
 def test_what_to_type_has_the_short_options_on_a_processor():
-    assert short_flags() == "--iterations 3000 --scale-recipe --resolution 4"
+    assert short_flags() == "--fast --resolution 4"
     for size, divisor in (((600, 400), ""), ((601, 400), " --resolution 2"), ((1600, 1200), " --resolution 4"),
                           ((4000, 3000), " --resolution 8"), ((9000, 6000), " --resolution 8")):
-        assert short_flags(*size) == "--iterations 3000 --scale-recipe" + divisor
-    assert train_command("my scene", "OUT", "cpu", 320, 240).endswith(
-        " train 'my scene' -o OUT --iterations 3000 --scale-recipe")
+        assert short_flags(*size) == "--fast" + divisor
+    assert train_command("my scene", "OUT", "cpu", 320, 240).endswith(" train 'my scene' -o OUT --fast")
     assert train_command("scene", "OUT", "cuda", 320, 240).endswith(" train scene -o OUT")
 
 

@@ -49,7 +49,7 @@ def words_of(config):
     """The options of a training on the command line."""
     names = ("batch", "budget", "strategy", "strategy_options", "iterations", "blend_mode", "sh_degree_interval",
              "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
-             "densify_grad_threshold", "checkpoint_every")
+             "densify_grad_threshold", "position_lr_max_steps", "checkpoint_every")
     return [config.scene, "-o", config.output, "--quiet",
             *(f"--{name.replace('_', '-')}={getattr(config, name)}" for name in names)]
 
@@ -131,7 +131,7 @@ def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
         os.remove(checkpoint)
         process.kill()
         errors = process.stderr.read()  # to its end, at which the worker has ended
-    assert "interrupted; continue it with --resume" in errors, errors
+    assert f"train --resume -o {tiny_config.output}\n" in errors, errors
     assert os.path.isfile(checkpoint)
 
 
@@ -240,6 +240,20 @@ def test_processes_that_do_not_meet_say_so(monkeypatch, capsys):
     with pytest.raises(TrainerError, match=f"the processes of the training do not meet at 127.0.0.1:{port} .*: ."):
         join_group("cpu")
     assert capsys.readouterr().err.startswith(f"note: process 1 of 2 waits for the others at 127.0.0.1:{port}\n")
+
+
+@pytest.mark.parametrize("name", ["no-such-host.invalid", "a..b", "x" * 300, ""])
+def test_an_address_that_leads_nowhere_is_refused(monkeypatch, name):
+    """torch would try it for two hours; here a host that starts meanwhile has some seconds."""
+    def unknown(*arguments, **options):
+        raise socket.gaierror(-2, "Name or service not known")
+
+    for variable, value in {**TORCHRUN, "MASTER_ADDR": name}.items():
+        monkeypatch.setenv(variable, value)
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    monkeypatch.setattr(group_module, "PATIENCE", 0.01)
+    with pytest.raises(TrainerError, match=rf"do not meet at .* no host of the name {name!r} is known \(.*not known"):
+        join_group("cpu")
 
 
 def test_more_gpus_than_there_are_is_refused(monkeypatch):

@@ -114,19 +114,19 @@ def test_degree_zero_renders_the_base_colour_alone():
 def test_ply_round_trip(tmp_path, mode, sh_degree):
     model = random_model(sh_degree=sh_degree)
     path = str(tmp_path / "deep" / "model.ply")
-    save_model(path, model, mode, 0.1)
+    save_model(path, model, mode, 0.1, faint_below=sh_degree or None)
     loaded, recorded = load_model(path, "cpu")
-    assert recorded == (mode, 0.1 if mode in GATED_MODES else None), "the other modes have no choice"
+    assert recorded == (mode, 0.1 if mode in GATED_MODES else None, sh_degree or None), "the others have no choice"
     assert loaded.sh_degree == loaded.active_sh_degree == sh_degree
     for name in PARAMETERS:
         assert torch.equal(loaded.raw[name], model.raw[name]), name
 
 
-def test_blend_mode_of_a_file_is_never_guessed():
+def test_a_file_that_records_no_blend_mode_is_alpha_and_says_so(capsys):
     assert agreed_blend_mode("a.ply", "smoe", None) == "smoe"
     assert agreed_blend_mode("a.ply", None, "alpha") == "alpha"
-    with pytest.raises(TrainerError, match=r"a\.ply does not say which blend mode.*--blend-mode"):
-        agreed_blend_mode("a.ply", None, None)
+    assert not capsys.readouterr().err and agreed_blend_mode("a.ply", None, None) == "alpha"
+    assert "note: a.ply records no blend mode, so it is alpha" in capsys.readouterr().err
     with pytest.raises(TrainerError, match="trained with the blend mode smoe, not alpha"):
         agreed_blend_mode("a.ply", "smoe", "alpha")
     with pytest.raises(TrainerError, match="'future'"):
@@ -172,4 +172,4 @@ def test_files_of_other_programs_load_without_a_mode(tmp_path):
     raw = {name: tensor.detach().numpy() for name, tensor in model.raw.items()}
     io.write_gaussians(str(tmp_path / "a.ply"), io.Gaussians(
         raw["means3D"], raw["dc"], raw["shs"], raw["opacities"], raw["scales"], raw["rotations"]))
-    assert load_model(str(tmp_path / "a.ply"), "cpu")[1] == (None, None)
+    assert load_model(str(tmp_path / "a.ply"), "cpu")[1] == (None, None, None)

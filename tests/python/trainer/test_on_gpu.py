@@ -252,7 +252,7 @@ def test_two_gpus_train_the_bits_of_one(config, tmp_path, options):
     words = ["train", config.scene, "-o", others[0].output, "--gpus", "2", "--quiet", "--deterministic"]
     for name in ("batch", "budget", "strategy", "strategy_options", "iterations", "blend_mode", "sh_degree_interval",
                  "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
-                 "densify_grad_threshold"):
+                 "densify_grad_threshold", "position_lr_max_steps"):
         words.append(f"--{name.replace('_', '-')}={getattr(config, name)}")
     assert main(words) == 0 and main(["train", "--resume", "-o", others[1].output, "--gpus", "2", "--quiet"]) == 0
     models = []

@@ -164,11 +164,18 @@ def test_an_mp4_plays_every_frame(tmp_path):
 
 @pytest.mark.parametrize("output, arguments, text", [
     ("a.gif", ["--depth"], "a video has room for colours only"), ("a", ["--frames", "0"], "--frames is 0"),
-    ("a.gif", ["--fps", "0"], "--fps is 0"),
+    *(("a.gif", ["--fps", fps], f"--fps is {fps}; it must be from 0.01 to 1000")
+      for fps in ("0", "1e-308", "0.009", "-1", "1001", "inf", "nan")),
     ("a.mov", [], "a video can end in .mp4, .gif or .webp; .mov is not written")])
 def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, arguments, text):
     assert orbit(model, tmp_path / output, *arguments) == 1
     assert text in capsys.readouterr().err and not (tmp_path / output).exists()
+
+
+@pytest.mark.parametrize("ending", [".gif", ".webp"])
+@pytest.mark.parametrize("fps", ["0.01", "1000"])
+def test_the_slowest_and_the_fastest_video_are_written(model, tmp_path, fps, ending):
+    assert orbit(model, tmp_path / f"a{ending}", "--fps", fps, "--frames", "2") == 0
 
 
 def test_an_mp4_without_its_library_is_refused(model, tmp_path, capsys, monkeypatch):

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import random
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ import torch
 from dsmoe.model import PARAMETERS
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
-from dsmoe.training.graphs import Graphs
+from dsmoe.training.graphs import IDLE, MOST_KINDS, MOST_SEEN, WARM_UP, Captured, Graphs
 from dsmoe.training.passes import AutogradPasses, DirectPasses
 from dsmoe.training.trainer import Trainer
 
@@ -111,6 +112,63 @@ def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypa
     assert all(report == reports[0] for report in reports)
     for other in trainers[1:]:
         assert_equal(trainers[0], other)
+
+
+class Counted(Graphs):
+    """Steps that compute nothing: which are captured, replayed and launched."""
+
+    def __init__(self):
+        super().__init__()
+        self.captures = []
+
+    def _new(self, num_gaussians, capture):
+        self.captures.append(self.kind_now)
+        return Captured(self._record)
+
+    def run(self, memory, kinds):
+        """Returns of each step whether it was a replay; the step of a capture is one."""
+        replayed = []
+        for self.kind_now in kinds:
+            replayed.append(self.find(memory, self.kind_now, lambda _: None) is not None)
+        return replayed
+
+
+def views_of(kinds, epochs):
+    """The kinds of the views of each step, every view once in each epoch."""
+    chance = random.Random(3)
+    return [kind for _ in range(epochs) for kind in chance.sample(kinds, len(kinds))]
+
+
+@pytest.mark.parametrize("num_kinds", [1, 4, 5, 8, 40])
+@pytest.mark.parametrize("views", [40, 200])
+def test_kinds_of_views_are_captured_once_and_not_in_turns(num_kinds, views):
+    """As many as fit; a capture takes as long as several steps. 10 densifications, each over new parameters."""
+    graphs, steps = Counted(), iter(views_of([view % num_kinds for view in range(views)], 1000 // views))
+    graphs.run([torch.zeros(3)], [0] * WARM_UP)
+    for _ in range(10):
+        kinds, before = [next(steps) for _ in range(100)], len(graphs.captures)
+        replayed = graphs.run([torch.zeros(3)], kinds)
+        captured = graphs.captures[before:]
+        twice = [kind for kind in dict.fromkeys(kinds) if kinds.count(kind) > 1]
+        assert len(captured) == len(set(captured)) == min(MOST_KINDS, len(twice))
+        assert sum(replayed) == sum(kinds.count(kind) - 1 for kind in captured), "all but the first of each"
+
+
+def test_a_kind_that_comes_no_more_makes_place_for_another():
+    """As the kinds of a loss that has changed."""
+    graphs, memory = Counted(), [torch.zeros(3)]
+    graphs.run(memory, [0] * WARM_UP)
+    old, new = range(MOST_KINDS), range(MOST_KINDS, 2 * MOST_KINDS)
+    assert all(graphs.run(memory, views_of(list(old), 20))[2 * MOST_KINDS:])
+    later = graphs.run(memory, views_of(list(new), 2 + IDLE // MOST_KINDS + 1))
+    assert not any(later[:IDLE - MOST_KINDS]) and all(later[-MOST_KINDS:])
+    assert sorted(graphs.captures) == [*old, *new]
+
+
+def test_kinds_that_never_repeat_are_not_all_remembered():
+    graphs = Counted()
+    assert not any(graphs.run([torch.zeros(3)], range(3 * MOST_SEEN)))
+    assert len(graphs._seen) == MOST_SEEN
 
 
 class Starved(Repeats):

@@ -175,6 +175,43 @@ def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "scene").exists()
 
 
+def test_what_reading_would_wait_for_is_refused(tmp_path, capsys, monkeypatch):
+    """A pipe, and links to a device and to nothing, each with the name of a photograph."""
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    for index in range(3):
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{index}.png")
+    strange = tmp_path / "a.png"
+    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero"), lambda path: path.symlink_to("nothing")):
+        make(strange)
+        assert f"{strange}: is no file that can be read (a pipe, " in fails(capsys, tmp_path, "-o", tmp_path / "scene")
+        strange.unlink()
+    (tmp_path / "b.png").symlink_to("0.png")
+    assert "pip install pycolmap" in fails(capsys, tmp_path, "-o", tmp_path / "scene")
+
+
+@pytest.mark.parametrize("where", ["photograph", "folder", "output"])
+def test_a_name_that_is_no_utf_8_is_refused_in_a_line(where, tmp_path, capsys, monkeypatch):
+    """COLMAP's files hold names as UTF-8."""
+    monkeypatch.setitem(sys.modules, "pycolmap", sys)
+    odd = os.fsdecode(b"a\xff")
+    photographs, output = (os.path.join(tmp_path, odd if where == name else name) for name in ("folder", "output"))
+    os.mkdir(photographs)
+    for name in ("0", "1", odd if where == "photograph" else "2"):
+        Image.new("RGB", (8, 8)).save(os.path.join(photographs, f"{name}.png"))
+    assert "a\\udcff" in (text := fails(capsys, photographs, "-o", output)) and "only names that are UTF-8" in text
+
+
+def test_a_video_among_photographs_gets_the_line_of_ffmpeg(tmp_path):
+    said = []
+    for name in ("walk.MOV", "0.jpg", "1.jpg"):
+        (tmp_path / name).write_text("")
+    with pytest.raises(SceneError, match="2 photographs .* are needed; walk.MOV is a video; of a video .* ffmpeg -i"):
+        photos.photo_names(str(tmp_path), str(tmp_path / "scene"), said.append)
+    (tmp_path / "2.jpg").write_text("")
+    assert len(photos.photo_names(str(tmp_path), str(tmp_path / "scene"), said.append)) == 3
+    assert len(said) == 1 and said[0].startswith("note: walk.MOV is a video; ") and said[0].endswith("it is left out")
+
+
 def test_hidden_files_and_the_scene_itself_are_no_photographs(tmp_path):
     for name in ("a.jpg", "walk/b.PNG", "walk/._b.jpg", ".thumbnails.jpg", "scene/images/a.jpg", "scenery/c.jpg"):
         os.makedirs((tmp_path / name).parent, exist_ok=True)

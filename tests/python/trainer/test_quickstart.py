@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from diff_smoe_rasterization.io import read_gaussians
+from diff_smoe_rasterization.io import read_colmap, read_gaussians
 from dsmoe import cli, quickstart, short_run
+from dsmoe.presets import FAST
 from dsmoe.results.pictures import MARGIN, comparison, evenly_spaced, window_of_differences
 from dsmoe.system import files
 
@@ -94,7 +95,7 @@ def test_what_it_chose_is_said_before_it_trains(tiny_scene, monkeypatch):
     pipe = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(pipe))
     quickstart.choose_options(tiny_scene, {})
-    assert pipe.getvalue().startswith(b"chosen for a run of some minutes: --iterations 2000 --strategy steady ")
+    assert pipe.getvalue().startswith(b"chosen for a run of some minutes: --iterations 3000 ")
 
 
 def test_another_scene_is_refused_and_no_picture_is_stale(tiny_scene, output, tmp_path, capsys):
@@ -130,7 +131,9 @@ def test_nothing_is_written_where_a_link_in_the_folder_leads(tiny_scene, tmp_pat
 
 def test_given_options_win_over_chosen_ones(tiny_scene):
     chosen = quickstart.choose_options(tiny_scene, {})
-    assert (chosen.iterations, chosen.densify_until_iter, chosen.strategy) == (2000, 1000, "steady")
+    assert (chosen.iterations, chosen.densify_until_iter, chosen.strategy) == (3000, 1050, "importance")
+    # About 144 points: behind 50, at 100 to 500, each densification doubles them; the least would be 10,000.
+    assert chosen.budget == 2**5 * len(read_colmap(tiny_scene).points.positions)
     assert chosen.resolution == -1, "images this small are not reduced"
     given = quickstart.choose_options(tiny_scene, {"iterations": 600, "densify_until_iter": 100, "strategy": "3dgs"})
     assert (given.iterations, given.densify_until_iter, given.opacity_reset_interval) == (600, 100, 60)
@@ -139,20 +142,16 @@ def test_given_options_win_over_chosen_ones(tiny_scene):
 
 def test_large_scenes_are_reduced_and_told(monkeypatch, tiny_scene, capsys):
     monkeypatch.setattr(short_run, "MAX_PIXELS", 200)  # of 32x24: width 16.3
-    monkeypatch.setattr(short_run, "MAX_POINTS", 50)
-    config = quickstart.choose_options(tiny_scene, {})
-    assert (config.resolution, config.init_points) == (16, 50)
-    text = capsys.readouterr().out
-    assert "--resolution 16" in text and "--init-points 50" in text
-    config = quickstart.choose_options(tiny_scene, {"resolution": 1})
-    assert (config.resolution, config.init_points) == (1, 50)
+    assert quickstart.choose_options(tiny_scene, {}).resolution == 16
+    assert "--resolution 16" in capsys.readouterr().out
+    assert quickstart.choose_options(tiny_scene, {"resolution": 1}).resolution == 1
 
 
 def test_a_gpu_trains_at_full_size(monkeypatch, tiny_scene, capsys):
     monkeypatch.setattr(short_run, "MAX_PIXELS", 200)
     config = quickstart.choose_options(tiny_scene, {"device": "cuda"})
     assert (config.resolution, config.init_points, config.device) == (-1, 0, "cuda")
-    assert config.iterations > 2000 and config.densify_until_iter == config.iterations // 2
+    assert config.iterations == FAST["cuda"].iterations and config.strategy == "importance"
     assert "about a minute: --iterations" in capsys.readouterr().out
 
 

@@ -1,12 +1,15 @@
 """A killed run, resumed, ends bit for bit where an undisturbed one does; and runs are reproducible at all."""
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import locale
 import os
 import resource
 import shutil
 import subprocess
+import time
 
 import pytest
 import torch
@@ -20,7 +23,7 @@ from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system import files
 from dsmoe.train import train
-from dsmoe.training import checkpoint, state_check
+from dsmoe.training import checkpoint, randomness, state_check
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
 from dsmoe.training.randomness import ViewOrder
 from dsmoe.training.trainer import Trainer
@@ -79,6 +82,104 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, blend_mode, kil
 def test_a_learned_gate_and_random_backgrounds_resume_bit_for_bit(tiny_config, tmp_path, options):
     (_, row), (_, resumed) = killed_and_resumed(tiny_config, tmp_path, 26, **options)
     assert (resumed["psnr"], resumed["background_gate"]) == (row["psnr"], row["background_gate"])
+
+
+@contextlib.contextmanager
+def other_locale():
+    before = locale.setlocale(locale.LC_ALL)
+    for name in ("de_DE.UTF-8", "fr_FR.UTF-8", "C"):  # whose numbers have commas, if they are installed
+        with contextlib.suppress(locale.Error):
+            locale.setlocale(locale.LC_ALL, name)
+            break
+    yield
+    locale.setlocale(locale.LC_ALL, before)
+
+
+@contextlib.contextmanager
+def other_time_zone():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TZ", "Pacific/Kiritimati")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+@contextlib.contextmanager
+def other_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3 if before != 3 else 2)
+    yield
+    torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def gpus(count):
+    """A machine where torch sees so many GPUs. Each has a generator; those of others raise, as CUDA's do."""
+    states = [torch.full((16,), number, dtype=torch.uint8) for number in range(count)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.cuda, "is_available", lambda: count > 0)
+        patch.setattr(torch.cuda, "device_count", lambda: count)
+        patch.setattr(torch.cuda, "get_rng_state", lambda device=0: states[device])
+        patch.setattr(torch.cuda, "get_rng_state_all", lambda: list(states))
+        patch.setattr(torch.cuda, "set_rng_state", lambda state, device=0: states.__setitem__(device, state))
+        patch.setattr(torch.cuda, "set_rng_state_all",
+                      lambda all_of: [states.__setitem__(device, state) for device, state in enumerate(all_of)])
+        yield states
+
+
+@pytest.mark.parametrize("here, there", [
+    (contextlib.nullcontext, other_locale), (contextlib.nullcontext, other_time_zone),
+    (contextlib.nullcontext, other_threads), (lambda: gpus(4), lambda: gpus(1)), (lambda: gpus(4), lambda: gpus(0)),
+    (lambda: gpus(0), lambda: gpus(2))], ids=["locale", "time zone", "threads", "1 of 4 GPUs", "no GPU", "new GPUs"])
+def test_a_run_resumes_on_another_machine(tiny_config, tmp_path, here, there):
+    """A checkpoint has nothing of the machine that wrote it."""
+    config = dataclasses.replace(tiny_config, iterations=24)
+    straight = dataclasses.replace(config, output=str(tmp_path / "straight"))
+    train(straight, progress=False)
+    with here(), pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        kill_at(patch, 21)
+        train(config, progress=False)
+    with there():
+        train(config, resume=True, progress=False)
+    assert ply_bytes(config) == ply_bytes(straight)
+
+
+def test_the_generator_of_a_gpu_is_kept_and_older_files_have_those_of_all():
+    with gpus(4) as others:
+        others[0] = torch.full((16,), 9, dtype=torch.uint8)
+        state = randomness.random_state("cuda")
+        older = {**state, "cuda": torch.cuda.get_rng_state_all()}
+    assert randomness.random_state("cpu")["cuda"] == []
+    for each in (state, older):
+        with gpus(1) as mine:
+            randomness.restore_random_state(each, "cuda")
+            assert len(mine) == 1 and mine[0].tolist() == [9] * 16
+
+
+@pytest.mark.parametrize("error", [
+    RuntimeError("CUDA error: an illegal memory access was encountered"), ModuleNotFoundError("No module named 'x'"),
+    torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), MemoryError()], ids=repr)
+@pytest.mark.parametrize("function", ["check_state", "load_state_dict"])
+def test_a_machine_that_fails_does_not_make_a_checkpoint_damaged(tiny_config, monkeypatch, function, error):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    train(config, progress=False)
+
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(Trainer, function, fail)
+    with pytest.raises(type(error)) as raised:
+        train(config, resume=True, progress=False)
+    assert raised.value is error
+
+
+def test_an_error_of_taking_a_checkpoint_over_is_no_damage(tiny_config, monkeypatch):
+    """What was looked at and found whole is not to be removed, whatever happens behind that."""
+    config = dataclasses.replace(tiny_config, iterations=2)
+    train(config, progress=False)
+    monkeypatch.setattr(Trainer, "load_state_dict", lambda *_: {}["of this program's own making"])
+    with pytest.raises(KeyError, match="of this program's own making"):
+        train(config, resume=True, progress=False)
 
 
 def test_resume_before_the_first_checkpoint_starts_anew(tiny_config, tmp_path, monkeypatch, capsys):
@@ -216,8 +317,8 @@ def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, mon
     config = dataclasses.replace(tiny_config, eval_every=10)
     train(config, progress=False)
     assert sorted(os.listdir(config.output)) == [
-        ".dsmoe.json", ".dsmoe.lock", "checkpoint.pt", "config.json", "history.json", "loss.png", "per_view.json",
-        "point_cloud", "results.json"]
+        ".dsmoe.json", ".dsmoe.lock", "cameras.json", "checkpoint.pt", "config.json", "history.json", "loss.png",
+        "per_view.json", "point_cloud", "results.json"]
     kill_at(monkeypatch, 5)
     with pytest.raises(Killed):
         train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)

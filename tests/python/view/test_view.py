@@ -176,6 +176,9 @@ def test_a_training_that_is_replaced_is_followed(tiny_scene, tmp_path):  # noqa:
     ("null", "localhost:8080", "a page of 'null' asks"),
     ("http://evil.example:8080", "evil.example:8080", "'evil.example:8080' is no name of this machine"),
     ("http://localhost.evil.example", "localhost.evil.example", "no name of this machine"),
+    *((f"http://{host}", host, "no name of this machine") for host in (
+        "[::1]evil.example", "[::1].evil.example:8080", "[::1]:8080.evil.example", "[localhost]", "[::1", "::1]",
+        "localhost:80:evil.example", "localhost:evil.example", "[::1]:80x", "[[::1]]", "[]", "", "[evil.example]")),
     (None, None, "None is no name of this machine")])
 def test_pages_of_others_are_refused(origin, host, words):
     why = refusal(origin, host, "gpu7")

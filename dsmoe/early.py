@@ -1,0 +1,84 @@
+"""What is wrong with paths and options, said before torch is loaded, which takes seconds."""
+from __future__ import annotations
+
+import argparse
+import copy
+import os
+
+from .config import TrainConfig
+from .config_arguments import given_options, take_paper
+from .errors import SceneError, TrainerError
+from .system.files import check_output, is_file, is_folder
+
+VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+FROM_VIDEO = "of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
+LEAST_FPS, MOST_FPS = 0.01, 1000.0  # a .gif shows a frame for at most 655 s
+
+
+def check_early(arguments: argparse.Namespace) -> None:
+    """Raises TrainerError as the command would, for what needs no torch to be seen. Not all of it is."""
+    command, scene = arguments.command, getattr(arguments, "scene", None)
+    if command == "scene":
+        check_photos(arguments.photos)
+    elif command == "train" and not arguments.resume and scene and getattr(arguments, "output", ""):
+        check_scene(scene)
+        _check_options(arguments)
+    elif command == "eval":
+        TrainConfig.load(arguments.output)
+    elif command in ("render", "export", "view"):
+        is_lone = command == "render" and not arguments.orbit
+        check_source(arguments.source, "and --scene" if is_lone else "")
+        if is_folder(arguments.source):
+            TrainConfig.load(arguments.source)
+        elif is_lone and not scene:
+            raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
+        if command == "render" and arguments.orbit:
+            check_orbit(arguments.frames, arguments.fps)
+        if command == "export" and arguments.output:
+            check_output(arguments.output, arguments.overwrite)
+    if command in ("eval", "render", "export", "view") and scene:
+        check_scene(scene)
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """Raises ConfigError for a number that no strategy and no preset takes."""
+    arguments = copy.copy(arguments)
+    take_paper(arguments)
+    given = {**given_options(arguments), "device": "cpu", "strategy": "steady", "strategy_options": ""}
+    if "iterations" not in given:  # a preset has its own, and --batch divides them
+        given.pop("batch", None)
+    TrainConfig(**given).validate()
+
+
+def check_source(source: str, besides: str = "") -> None:
+    """Raises TrainerError if there is no such folder or file. besides: what a .ply needs, for that error."""
+    if not is_folder(source) and not is_file(source):
+        raise TrainerError(f"{source}: no such file or folder; name the output folder of `dsmoe train`, or a .ply"
+                           + (f" {besides}" if besides else ""))
+
+
+def check_scene(folder: str) -> None:
+    """Raises SceneError if it is no folder."""
+    if not is_folder(folder):
+        is_one = "is a file; a scene is a folder" if is_file(folder) else "no such folder"
+        raise SceneError(f"scene {folder}: {is_one}")
+
+
+def check_photos(photos: str) -> None:
+    """Raises SceneError if it is no folder."""
+    if is_folder(photos):
+        return
+    if not is_file(photos):
+        raise SceneError(f"{photos}: no such folder of photographs")
+    if photos.lower().endswith(VIDEO_ENDINGS):
+        raise SceneError(f"{photos} is a file; {FROM_VIDEO}")
+    raise SceneError(f"{photos} is a file; name the folder of the photographs, such as "
+                     f"{os.path.dirname(photos) or '.'}")
+
+
+def check_orbit(frames: int, fps: float) -> None:
+    """Raises TrainerError if no video has so many frames, or so many a second."""
+    if frames < 1:
+        raise TrainerError(f"--frames is {frames}; it must be at least 1")
+    if not LEAST_FPS <= fps <= MOST_FPS:
+        raise TrainerError(f"--fps is {fps:g}; it must be from {LEAST_FPS:g} to {MOST_FPS:g}")

@@ -1,0 +1,78 @@
+"""What `dsmoe train` chooses where nothing is given: how many Gaussians, and the presets `--fast` and `--best`."""
+from __future__ import annotations
+
+from typing import Any, Collection, Dict, NamedTuple, Optional
+
+from .config import LEARNED, TrainConfig, learned_gate_of
+from .errors import ConfigError
+
+STRATEGY = "importance"
+
+
+class Preset(NamedTuple):
+    """Options in place of defaults; those that are given win."""
+
+    iterations: int
+    until: float  # densify_until_iter, as a part of the iterations
+    settings: str  # of --strategy-options
+    options: Dict[str, Any] = {}
+
+
+class Numbers(NamedTuple):
+    """How many Gaussians a scene gets."""
+
+    per_point: int
+    least: int
+    most: int
+    without_points: int  # where the first points are random, as their number says nothing of the scene
+    most_points: int  # to start from
+
+
+FAST = {"cuda": Preset(7000, 0.35, "overshoot=1.5,removals=4"),
+        "cpu": Preset(3000, 0.35, "overshoot=1.5,removals=4")}  # growth and removals early: much is left to settle
+BEST = Preset(60_000, 0.5, "views=255", {"scaling_lr": 0.02})
+PRESETS = {"fast": FAST, "best": {"cuda": BEST, "cpu": BEST}}
+NUMBERS = {"cuda": Numbers(3, 20_000, 300_000, 100_000, 1_000_000),
+           "cpu": Numbers(1, 10_000, 60_000, 20_000, 100_000)}
+
+
+def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Dict[str, Any]:
+    """The options of a training, and for those that are not given the preset's and the default strategy.
+
+    name: in PRESETS, or None. Raises ConfigError if the preset is not of the given strategy.
+    """
+    options = {"strategy": STRATEGY, **options}
+    if name is None:
+        return options
+    if options["strategy"] != STRATEGY:
+        raise ConfigError(f"--strategy is {options['strategy']!r}; it must be left out or {STRATEGY} with --{name}")
+    preset = PRESETS[name][device]
+    iterations = options.get("iterations", preset.iterations)
+    given = options.get("strategy_options", "")
+    named = {part.partition("=")[0].strip() for part in given.split(",")}
+    settings = [part for part in preset.settings.split(",") if part.partition("=")[0] not in named]
+    return {**preset.options, "iterations": iterations, "densify_until_iter": max(2, round(preset.until * iterations)),
+            **options, "strategy_options": ",".join(filter(None, [given, *settings]))}
+
+
+def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, Any]:
+    """Options that depend on the scene, of those whose names are not given. Raises SceneError if it cannot be read."""
+    from .scenes.images import has_transparency
+    from .scenes.scene import read_layout
+    from .training.importance_strategy import reached_from
+
+    layout, numbers = read_layout(config), NUMBERS[config.device]
+    chosen: Dict[str, Any] = {}
+    points = len(layout.points.subset(config.init_points, config.seed).positions)
+    if layout.points.measured and "init_points" not in given and points > numbers.most_points:
+        points = chosen["init_points"] = numbers.most_points
+    if not config.budget:
+        wanted = numbers.without_points
+        if layout.points.measured:
+            wanted = min(max(numbers.per_point * points, numbers.least), numbers.most)
+        chosen["budget"] = min(wanted, reached_from(config, points))
+    if (config.background_gate == LEARNED and "background_gate_start" not in given
+            and has_transparency(layout.train[0].path)):
+        # Empty space shows the background; a gate that starts low takes most of a short training to rise.
+        chosen["background_gate_start"] = learned_gate_of("smoe_eq7")["background_gate_start"]
+    return chosen

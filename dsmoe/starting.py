@@ -1,0 +1,235 @@
+"""A trained model to start from: which file it is, what that holds, how it is blended, and what its folder knows."""
+from __future__ import annotations
+
+import ast
+import dataclasses
+import os
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Optional, Sequence
+
+import numpy as np
+import torch
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.settings import GATED_MODES
+
+from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of
+from .errors import ConfigError, TrainerError
+from .export.glb import glb_gaussians
+from .export.splat import splat_gaussians
+from .export.spz import spz_gaussians
+from .model import GaussianModel, finite_rows
+from .results.evaluation import evaluate
+from .results.modelfile import (
+    Recorded,
+    agreed_background_gate,
+    agreed_blend_mode,
+    model_path,
+    raw_of,
+    read_ply,
+    recorded_faint,
+)
+from .results.pictures import evenly_spaced
+from .results.rendering import Renderer, background_color
+from .scenes.images import View
+from .scenes.modelfolder import CAMERAS, CFG_ARGS, latest_model
+from .scenes.pointcloud import SH_C0, PointCloud
+from .system.files import is_file, is_folder
+
+if TYPE_CHECKING:
+    from .scenes.scene import Scene
+
+LEAST_PSNR = 15.0  # of a model on its scene, dB: with less they do not belong together
+CHECKED_VIEWS = 16
+LEAST_ABOVE_BOUND = 1e-3  # a learned gate begins above its bound
+CLEARLY = 0.1  # dB: the principal points of a model's program are seen by it
+READERS = {".splat": splat_gaussians, ".spz": spz_gaussians, ".glb": glb_gaussians}
+
+
+@dataclass(frozen=True)
+class Start:
+    """A model to start from."""
+
+    path: str
+    gaussians: io.Gaussians
+    blend_mode: str
+    background_gate: float
+    faint_below: Optional[float] = None  # as usual
+
+    @property
+    def count(self) -> int:
+        return len(self.gaussians.means3D)
+
+    def points(self) -> PointCloud:
+        """Places and base colours of the Gaussians."""
+        colors = 0.5 + SH_C0 * self.gaussians.dc[:, 0].astype(np.float64)
+        return PointCloud(self.gaussians.means3D.astype(np.float64), colors.clip(0, 1))
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a model lies."""
+
+    path: str
+    options: Dict[str, Any] = field(default_factory=dict)  # of TrainConfig, that its folder records; `scene` too
+
+
+class Quality(NamedTuple):
+    """The PSNR of a model on some training images, dB."""
+
+    views: int
+    psnr: float
+    centred: float  # with principal points in the images' centres
+
+    def text(self, config: TrainConfig) -> str:
+        """What to say of it."""
+        is_centred = config.principal_point == "centre"
+        text = f"it has {self.centred if is_centred else self.psnr:.2f} dB on {self.views} of the training images"
+        if is_centred or self.centred <= self.psnr + CLEARLY:
+            return text
+        return f"{text}; note: with --principal-point centre it has {self.centred:.2f} dB"
+
+
+def read_start(path: str) -> Start:
+    """Reads a .ply, .splat, .spz or .glb; what does not say how it is blended is of another program: alpha.
+
+    Raises TrainerError naming file and reason, also if a Gaussian cannot be shown.
+    """
+    ending = os.path.splitext(path)[1].lower()
+    try:
+        if ending in READERS:
+            with open(path, "rb") as file:
+                gaussians = READERS[ending](file.read())
+        else:
+            gaussians = read_ply(path)
+    except OSError as error:
+        raise TrainerError(f"{path}: {error.strerror or error}") from error
+    except TrainerError:
+        raise
+    except ValueError as error:
+        raise TrainerError(f"{path}: {error}") from error
+    count = len(gaussians.means3D)
+    bad = count - int(finite_rows(raw_of(gaussians)).sum())
+    if bad or not count:
+        what = f"{bad:,} of its {count:,} Gaussians have a number that is NaN or infinite" if bad else "it is empty"
+        raise TrainerError(f"{path}: {what}; `dsmoe export MODEL -o clean.glb` leaves such Gaussians out")
+    recorded = Recorded(gaussians.blend_mode, gaussians.background_gate)
+    mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")
+    return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None),
+                 recorded_faint(path, gaussians.comments))
+
+
+def find_model(source: str) -> Found:
+    """The model in a file, an output folder of `dsmoe train` or a model folder of 3DGS. Raises TrainerError."""
+    if is_file(source):
+        return Found(source)
+    if not is_folder(source):
+        raise TrainerError(f"{source}: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of "
+                           "`dsmoe train` or a model folder of 3DGS")
+    if holds_run(source):
+        return _found_run(source)
+    path = latest_model(source)
+    if not path:
+        raise TrainerError(f"{source}: no model is in it: neither {CONFIG_NAME} of `dsmoe train` nor point_cloud/"
+                           "iteration_N/point_cloud.ply of 3DGS")
+    options = _options_of_3dgs(source)
+    if not is_folder(options.get("scene", "")):
+        options.pop("scene", None)
+        if is_file(os.path.join(source, CAMERAS)):
+            options["scene"] = source
+    return Found(path, options)
+
+
+def _found_run(folder: str) -> Found:
+    config = TrainConfig.load(folder)
+    path = model_path(folder, config.iterations)
+    if not is_file(path):
+        raise TrainerError(f"{path}: no such file; the training in {folder} has not ended (continue it with --resume)")
+    names = ["test_every", "white_background", "random_background", "antialiasing"]
+    if config.background_gate != LEARNED:
+        names += ["blend_mode", "background_gate"]
+    photographs = is_folder(config.scene)
+    if photographs:
+        names += ["scene", "images", "strict", "resolution", "principal_point"]
+    options = {name: getattr(config, name) for name in names}
+    if not photographs and is_file(os.path.join(folder, CAMERAS)):
+        options.update(scene=folder, resolution=1)  # the cameras are those of the resized images
+    return Found(path, options)
+
+
+def _options_of_3dgs(folder: str) -> Dict[str, Any]:
+    """What cfg_args, a Namespace as text, says of the training; its loader moves principal points to the centre."""
+    options: Dict[str, Any] = {"principal_point": "centre"}
+    path = os.path.join(folder, CFG_ARGS)
+    if not is_file(path):
+        return options
+    with open(path, encoding="utf-8", errors="replace") as file:
+        text = file.read()
+    known: Dict[str, Any] = {}
+    for name, value in re.findall(r"[(, ](\w+)=('[^']*'|\"[^\"]*\"|[^,()]+)", text):
+        try:
+            known[name] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            continue  # an object of the trainer's own
+    if isinstance(known.get("source_path"), str):
+        options["scene"] = known["source_path"]
+    for name, kind in (("images", str), ("resolution", int), ("white_background", bool), ("antialiasing", bool)):
+        if isinstance(known.get(name), kind):
+            options[name] = known[name]
+    if known.get("eval") is False:  # then it trains on all images
+        options["test_every"] = 0
+    return options
+
+
+def blend_options(start: Start, given: Dict[str, Any]) -> Dict[str, Any]:
+    """Options of a training from the model, beside given ones: its blend, and a learned gate begins with its gate."""
+    mode = given.get("blend_mode") or start.blend_mode
+    options: Dict[str, Any] = {"blend_mode": mode}
+    if mode != start.blend_mode or mode not in GATED_MODES:
+        return options
+    if start.faint_below is not None:
+        options["faint_below"] = given.get("faint_below", start.faint_below)
+    if given.get("background_gate", LEARNED) == LEARNED and "background_gate_start" not in given:
+        bound = given.get("background_gate_bound", learned_gate_of(mode)["background_gate_bound"])
+        options["background_gate_start"] = max(start.background_gate, bound + LEAST_ABOVE_BOUND)
+    return options
+
+
+def start_renderer(start: Start, config: TrainConfig) -> Renderer:
+    """Renders the model as it was trained, on config.device."""
+    model = GaussianModel.from_gaussians(raw_of(start.gaussians, config.device), start.gaussians.sh_degree)
+    return Renderer(model, start.blend_mode, background_color(config.white_background, config.device),
+                    config.antialiasing, background_gate=start.background_gate, faint_below=start.faint_below)
+
+
+def check_start(scene: Scene, config: TrainConfig) -> Quality:
+    """How well the model to start from shows some training views.
+
+    Raises TrainerError if it does not, and ConfigError if the strategy cannot lead from it to the budget.
+    """
+    start = scene.start
+    assert start is not None
+    if config.strategy != "importance" and 0 < config.budget < start.count:
+        raise ConfigError(f"--budget is {config.budget}; with --strategy {config.strategy} it must be at least "
+                          f"{start.count}, which {start.path} has: only importance removes Gaussians to a number")
+    renderer = start_renderer(start, config)
+
+    def psnr(views: Sequence[View]) -> float:
+        with torch.no_grad():
+            moved = [view.to(config.device) for view in views]
+            return float(evaluate(renderer, moved, config.device, passes=1).metrics["psnr"] or 0)
+
+    views = [scene.train[index] for index in evenly_spaced(len(scene.train), CHECKED_VIEWS)]
+    there = psnr(views)
+    centred = [view.camera.centred() for view in views]
+    is_centred = all(abs(view.camera.cx - camera.cx) + abs(view.camera.cy - camera.cy) < 1e-6
+                     for view, camera in zip(views, centred))
+    quality = Quality(len(views), there, there if is_centred else psnr(
+        [dataclasses.replace(view, camera=camera) for view, camera in zip(views, centred)]))
+    if max(quality.psnr, quality.centred) < LEAST_PSNR:
+        raise TrainerError(f"{start.path} does not show {config.scene}: {there:.1f} dB on its images, and it must be "
+                           f"at least {LEAST_PSNR:g}. Is it another scene, are its poses others than those of the "
+                           "training (some programs move and scale them), or was its background white "
+                           "(--white-background)?")
+    return quality

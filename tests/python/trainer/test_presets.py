@@ -1,0 +1,107 @@
+"""What `dsmoe train` chooses where nothing is given: the strategy, a number of Gaussians, and the presets."""
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from test_cli import fails, results_of
+from test_scene_loading import nerf_folder  # noqa: F401
+
+from dsmoe.cli import main
+from dsmoe.config import TrainConfig
+from dsmoe.presets import NUMBERS, Numbers, chosen_for_scene, with_preset
+
+
+@pytest.mark.parametrize("words, budget, iterations, until, settings", [
+    (["--iterations", "30"], 90, 30, 10, "overshoot=1.5,removals=4"),
+    (["--iterations", "30", "--budget", "70"], 70, 30, 10, "overshoot=1.5,removals=4"),
+    (["--iterations", "30", "--init-points", "20"], 60, 30, 10, "overshoot=1.5,removals=4"),
+    (["--iterations", "30", "--strategy-options", "views=3,removals=2", "--densify-until-iter", "12"], 90, 30, 12,
+     "views=3,removals=2,overshoot=1.5")])
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_fast(tiny_scene, tmp_path, monkeypatch, mode, words, budget, iterations, until, settings):
+    """The tiny scene has 144 points: three for each would be 432, more than the bound that is set here."""
+    monkeypatch.setitem(NUMBERS, "cpu", Numbers(3, 10, 90, 20, 1000))
+    output = str(tmp_path / "out")
+    assert main(["train", tiny_scene, "-o", output, "--fast", "--blend-mode", mode, *words, "--quiet"]) == 0
+    config, (row,) = TrainConfig.load(output), results_of(output)
+    assert (config.budget, config.iterations, config.densify_until_iter) == (budget, iterations, until)
+    assert config.strategy_options == settings and row["num_gaussians"] == budget
+    assert config.position_lr_max_steps == 30 and config.sh_degree_interval == 1
+    assert main(["train", tiny_scene, "--resume", "-o", output, "--fast", "--blend-mode", mode, *words, "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("preset", ["fast", "best"])
+def test_presets_are_of_importance(tiny_scene, tmp_path, capsys, preset):
+    text = fails(capsys, "train", tiny_scene, "-o", str(tmp_path / "out"), f"--{preset}", "--strategy", "mcmc")
+    assert f"--strategy is 'mcmc'; it must be left out or importance with --{preset}" in text
+    with pytest.raises(SystemExit):
+        main(["train", "--resume", str(tmp_path / "out"), f"--{preset}"])
+    assert f"--{preset} needs SCENE" in capsys.readouterr().err
+
+
+def test_presets_have_defaults():
+    assert with_preset({"seed": 3}, None, "cuda") == {"seed": 3, "strategy": "importance"}
+    fast = {"strategy": "importance", "strategy_options": "overshoot=1.5,removals=4"}
+    assert with_preset({}, "fast", "cuda") == {**fast, "iterations": 7000, "densify_until_iter": 2450}
+    assert with_preset({}, "fast", "cpu") == {**fast, "iterations": 3000, "densify_until_iter": 1050}
+    best = {"strategy": "importance", "iterations": 60_000, "densify_until_iter": 30_000,
+            "strategy_options": "views=255"}
+    assert with_preset({}, "best", "cuda") == {**best, "scaling_lr": 0.02}
+    assert with_preset({"scaling_lr": 0.01}, "best", "cpu") == {**best, "scaling_lr": 0.01}
+
+
+def test_best_scales_all_milestones_and_takes_given_options(tiny_scene, tmp_path):
+    output = str(tmp_path / "out")
+    words = [tiny_scene, "-o", output, "--best", "--iterations", "30", "--budget", "70", "--quiet"]
+    assert main(["train", *words]) == 0
+    config = TrainConfig.load(output)
+    assert (config.iterations, config.densify_until_iter, config.position_lr_max_steps) == (30, 15, 30)
+    assert (config.strategy_options, config.scaling_lr, config.budget) == ("views=255", 0.02, 70)
+
+
+def test_without_options_importance_takes_a_number_that_the_scene_says(tiny_scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(NUMBERS, "cpu", Numbers(2, 10, 1000, 20, 1000))
+    output, words = str(tmp_path / "out"), ["--iterations", "30", "--quiet"]
+    assert main(["train", tiny_scene, "-o", output, *words]) == 0
+    said, config = capsys.readouterr().out, TrainConfig.load(output)
+    assert "strategy importance to 288 Gaussians" in said, "two for each of the 144 points"
+    assert "--budget N makes more or fewer, and --strategy 3dgs is the recipe of 3DGS" in said
+    assert (config.strategy, config.densify_until_iter) == ("importance", 15)
+    assert results_of(output)[0]["num_gaussians"] == 288
+    for more in ([tiny_scene, *words], []):
+        assert main(["train", *more, "--resume", "-o", output, "--quiet"]) == 0, "it keeps its number"
+    assert main(["train", tiny_scene, "-o", str(tmp_path / "other"), "--strategy", "3dgs", *words]) == 0
+    assert "--budget" not in capsys.readouterr().out
+    assert TrainConfig.load(str(tmp_path / "other")).budget == 0
+
+
+@pytest.mark.parametrize("words, reached", [(["--fast", "--iterations", "60"], 144 * 2**3),
+                                            (["--iterations", "4"], 144)])
+def test_a_chosen_number_is_one_that_growth_reaches(tiny_scene, tmp_path, words, reached):
+    """144 points; the least is 10,000. With 60 iterations growth ends before 11, and may double at 3, 6 and 9.
+
+    4 iterations have no time to grow.
+    """
+    output = str(tmp_path / "out")
+    assert main(["train", tiny_scene, "-o", output, *words, "--quiet"]) == 0
+    assert TrainConfig.load(output).budget == reached
+
+
+def test_a_number_does_not_follow_random_points(nerf_folder):
+    def chosen(**options):
+        config = TrainConfig(scene=nerf_folder, strategy="importance", blend_mode="smoe", **options)
+        return chosen_for_scene(config, options)
+
+    assert chosen() == chosen(init_points=50_000) == {
+        "budget": NUMBERS["cpu"].without_points, "background_gate_start": 1.0}, "its photographs have transparency"
+    assert chosen(device="cuda")["budget"] == NUMBERS["cuda"].without_points
+    assert chosen(background_gate_start=0.3, budget=40) == {}
+
+
+def test_as_many_points_are_taken_as_time_allows(tiny_scene, monkeypatch):
+    monkeypatch.setitem(NUMBERS, "cpu", Numbers(2, 10, 1000, 20, 60))
+    config = TrainConfig(scene=tiny_scene, strategy="importance", blend_mode="smoe")
+    assert chosen_for_scene(config, ()) == {"init_points": 60, "budget": 120}
+    given = dataclasses.replace(config, init_points=70)
+    assert chosen_for_scene(given, ("init_points",)) == {"budget": 140}

@@ -1,0 +1,453 @@
+"""`dsmoe simplify` and `dsmoe train --init`: a trained model as the start of a training."""
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.settings import BLEND_MODES
+from dsmoe import simplify as module
+from dsmoe.cli import main
+from dsmoe.config import TrainConfig
+from dsmoe.errors import ConfigError, TrainerError
+from dsmoe.inspection import open_renderer
+from dsmoe.model import GaussianModel
+from dsmoe.results.evaluation import evaluate
+from dsmoe.results.metrics import quantised
+from dsmoe.results.modelfile import load_model, model_path, raw_of
+from dsmoe.scenes.colmap import read_colmap_layout
+from dsmoe.scenes.scene import load_scene, read_layout
+from dsmoe.simplify import simplify
+from dsmoe.starting import find_model, read_start
+from dsmoe.train import train
+from dsmoe.training.importance_strategy import ImportanceStrategy
+from dsmoe.training.trainer import Trainer
+
+SHORT = {"iterations": 60, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def run(tiny_scene, tmp_path_factory):
+    """A run by alpha, of SH degree 1, at another resolution than a scene has by default."""
+    config = TrainConfig(scene=tiny_scene, output=str(tmp_path_factory.mktemp("run") / "out"), blend_mode="alpha",
+                         iterations=250, sh_degree=1, sh_degree_interval=50, checkpoint_every=0, resolution=30,
+                         strategy="steady", densify_from_iter=20, densify_until_iter=200, densification_interval=20)
+    train(config, progress=False)
+    return config
+
+
+def ply_of(config):
+    return model_path(config.output, config.iterations)
+
+
+def results_of(output):
+    with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
+        return json.load(file)
+
+
+def model_folder(run, folder, cfg_args=None, cameras=True):
+    """What 3DGS writes: the last of two models, cfg_args and cameras.json, by its own definition of these."""
+    for iteration in (7, 30):
+        path = model_path(str(folder), iteration)
+        os.makedirs(os.path.dirname(path))
+        shutil.copyfile(ply_of(run), path)
+    stored = io.read_gaussians(path)
+    io.write_gaussians(path, dataclasses.replace(stored, blend_mode=None, comments=()))
+    if cfg_args is not None:
+        (folder / "cfg_args").write_text(cfg_args)
+    if cameras:
+        entries = []
+        for index, view in enumerate(load_scene(run, progress=False).train):
+            camera = view.camera
+            entries.append({"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height,
+                            "position": (-camera.rotation.T @ camera.translation).tolist(),
+                            "rotation": camera.rotation.T.tolist(), "fx": camera.fx, "fy": camera.fy})
+        (folder / "cameras.json").write_text(json.dumps(entries))
+    return str(folder)
+
+
+def test_a_run_becomes_one_of_fewer_gaussians(run, tmp_path, capsys):
+    before = open(ply_of(run), "rb").read()
+    output = str(tmp_path / "out")
+    assert main(["simplify", run.output, "--keep", "0.5", "-o", output, "--iterations", "60", "--quiet"]) == 0
+    said = capsys.readouterr().out
+    trained, = results_of(run.output)
+    row, = results_of(output)
+    model, recorded = load_model(model_path(output, 60), "cpu")
+    assert row["num_gaussians"] == model.num_gaussians == round(0.5 * trained["num_gaussians"])
+    assert (row["blend_mode"], recorded.blend_mode, model.sh_degree) == ("alpha", "alpha", 1)
+    for name in ("psnr", "ssim", "num_gaussians"):  # as the training measured them
+        assert row["start"][name] == pytest.approx(trained[name], rel=1e-6)
+    assert row["protocol"]["resolution"] == 30 and row["protocol"]["init"] == "point_cloud.ply"
+    assert f"{trained['num_gaussians']:,} Gaussians of SH degree 1, blend mode alpha" in said
+    assert open(ply_of(run), "rb").read() == before, "the model itself stays"
+
+
+def test_it_is_better_than_only_leaving_gaussians_out(run, tmp_path):
+    row = simplify(run.output, str(tmp_path / "out"), keep=0.3, **SHORT)
+    start = io.read_gaussians(ply_of(run))
+    opacities = start.opacity_logits[:, 0]
+    kept = np.sort(np.argsort(-opacities)[:row["num_gaussians"]])  # the usual rule: the most opaque stay
+    model = GaussianModel.from_gaussians({name: rows[kept] for name, rows in raw_of(start).items()}, 1)
+    left = open_renderer(run, ply_of(run), None, "cpu").of(model, 1.0)
+    trained = open_renderer(run, model_path(str(tmp_path / "out"), 60), None, "cpu")
+    views = load_scene(run, progress=False).train
+    before, after = (evaluate(renderer, views, "cpu", passes=1).metrics["psnr"] for renderer in (left, trained))
+    assert after > before + 1, "60 steps that know the images are worth more than a decibel"
+
+
+def test_removals_begin_at_once_and_nothing_grows(run):
+    config = run.changed(init=ply_of(run), strategy="importance", budget=20, densify_until_iter=200,
+                         densify_from_iter=0, densification_interval=10)
+    scene = load_scene(config, progress=False)
+    strategy = Trainer(config, scene).strategy
+    assert isinstance(strategy, ImportanceStrategy)
+    assert strategy.removals[0] == 4 and strategy.growth_ends == 0, "2 % of 200"
+    assert strategy.most() == len(scene.points.positions)
+    grows = Trainer(config.changed(budget=10 * len(scene.points.positions)), scene).strategy  # above the model's number
+    assert grows.growth_ends == 107 and grows.removals[0] == 109, "8 / 15 and 8.2 / 15"
+
+
+def test_what_no_view_needs_goes_first(run, monkeypatch):
+    """As far as the budget allows."""
+    monkeypatch.setattr("dsmoe.training.importance_strategy.DROPS_UNNEEDED", True)
+    scene = load_scene(run.changed(init=ply_of(run)), progress=False)
+    gaussians = scene.start.gaussians
+    means = gaussians.means3D.copy()
+    hidden = np.array([1, 5, 8])
+    means[hidden] = [0, 1000, 0]  # above all cameras, which look down
+    scene = scene.starting_with(dataclasses.replace(scene.start, gaussians=dataclasses.replace(
+        gaussians, means3D=means)))
+    count = len(means)
+    for budget, left in ((20, 0), (count, 3)):
+        config = run.changed(init=ply_of(run), strategy="importance", budget=budget, densify_until_iter=200)
+        trainer = Trainer(config, scene)
+        trainer.step()
+        assert int((trainer.model.raw["means3D"][:, 1] > 900).sum()) == left
+        assert budget <= trainer.num_gaussians <= count - 3 + left
+
+
+def test_alpha_becomes_smoe_and_a_smoe_model_keeps_its_gate(run, tmp_path, capsys):
+    row = simplify(run.output, str(tmp_path / "smoe"), keep=0.5, blend_mode="smoe", **SHORT)
+    assert (row["blend_mode"], row["start"]["blend_mode"]) == ("smoe", "alpha")
+    assert row["start"]["psnr"] == pytest.approx(results_of(run.output)[0]["psnr"], rel=1e-6)
+    config = TrainConfig.load(str(tmp_path / "smoe"))
+    stored = dataclasses.replace(io.read_gaussians(ply_of(config)), background_gate=0.375, comments=())
+    ply = str(tmp_path / "smoe.ply")
+    io.write_gaussians(ply, stored)
+    for words in (["simplify", ply, "--scene", run.scene, "--budget", "30"], ["train", run.scene, "--init", ply]):
+        output = str(tmp_path / words[0])
+        assert main([*words, "-o", output, "--iterations", "4", "--resolution", "30", "--quiet"]) == 0
+        config = TrainConfig.load(output)
+        assert (config.blend_mode, config.background_gate, config.background_gate_start) == ("smoe", "learned", 0.375)
+    capsys.readouterr()
+    assert main(["simplify", ply, "--scene", run.scene, "--budget", "30", "-o", str(tmp_path / "no"), "--blend-mode",
+                 "alpha"]) == 1
+    assert "dsmoe export OUT --bake alpha" in capsys.readouterr().err
+
+
+def test_without_photographs_a_model_is_its_own_teacher(run, tmp_path, capsys):
+    (tmp_path / "model").mkdir()
+    folder = model_folder(run, tmp_path / "model", "Namespace(source_path='/nowhere', eval=True, resolution=-1)")
+    config = TrainConfig(scene=folder, blend_mode="alpha", test_every=0)
+    scene = load_scene(config, progress=False)
+    renderer = open_renderer(run, ply_of(run), None, "cpu")
+    photographs = load_scene(run, progress=False).train
+    assert [view.camera.name for view in scene.train] == [view.camera.name for view in photographs]
+    for view, photograph in zip(scene.train, photographs):
+        assert (view.camera.width, view.camera.height) == (photograph.camera.width, photograph.camera.height)
+        with torch.no_grad():
+            shown = renderer(photograph.camera.centred()).color
+        assert (view.image_float() - quantised(shown)).abs().max() <= 1 / 255 + 1e-6, "cameras.json has 64-bit numbers"
+    output = str(tmp_path / "out")
+    assert main(["simplify", folder, "--budget", "40", "-o", output, "--iterations", "60", "--quiet"]) == 0
+    row, = results_of(output)
+    assert (row["num_gaussians"], row["protocol"]["scene_kind"], row["protocol"]["test_views"]) == (40, "model", 1)
+    assert "measured against renderings of the model" in capsys.readouterr().out
+    assert main(["eval", output, "--device", "cpu"]) == 0, "what was trained on can be made again"
+    assert main(["simplify", folder, "--loses", "1", "-o", str(tmp_path / "no")]) == 1
+    assert "--loses compares with photographs" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
+def test_a_run_whose_scene_is_gone_is_its_own_teacher(run, tmp_path):
+    """By the cameras.json that it has written: sizes and principal points are those of its images."""
+    scene = shifted_scene(run.scene, str(tmp_path / "scene"), 1.5)
+    config = run.changed(scene=scene, init=ply_of(run), iterations=4, densify_until_iter=0,
+                         output=str(tmp_path / "run"))
+    train(config, progress=False)
+    photographs = load_scene(config, progress=False)
+    shutil.rmtree(scene)
+    row = simplify(config.output, str(tmp_path / "out"), budget=40, **SHORT)
+    assert (row["protocol"]["scene_kind"], row["protocol"]["image_size"]) == ("model", [30, 22])
+    rendered = load_scene(TrainConfig.load(str(tmp_path / "out")), progress=False)
+    for mine, theirs in ((rendered.train, photographs.train), (rendered.test, photographs.test)):
+        assert [view.camera.name for view in mine] == [view.camera.name for view in theirs]
+        for view, photograph in zip(mine, theirs):
+            for name in ("fx", "fy", "cx", "cy", "width", "height"):
+                assert getattr(view.camera, name) == getattr(photograph.camera, name)
+            assert np.allclose(view.camera.rotation, photograph.camera.rotation, atol=1e-12)
+            assert np.allclose(view.camera.translation, photograph.camera.translation, atol=1e-12)
+
+
+def test_a_model_folder_says_where_and_how_it_was_trained(run, tmp_path):
+    (tmp_path / "model").mkdir()
+    text = (f"Namespace(sh_degree=3, source_path={run.scene!r}, model_path='x', images='images', resolution=30, "
+            "white_background=False, eval=False, depths='', antialiasing=False, thing=<object at 0x7f>)")
+    folder = model_folder(run, tmp_path / "model", text)
+    found = find_model(folder)
+    assert found.path == model_path(folder, 30)
+    assert found.options == {"scene": run.scene, "images": "images", "resolution": 30, "white_background": False,
+                             "antialiasing": False, "principal_point": "centre", "test_every": 0}
+    row = simplify(folder, str(tmp_path / "out"), budget=40, **SHORT)
+    assert row["protocol"]["scene_kind"] == "colmap" and row["psnr"] is None, "it had trained on all images"
+
+
+def shifted_scene(scene, folder, pixels):
+    """The scene with principal points so far from the centre."""
+    shutil.copytree(scene, folder)
+    model = io.read_colmap(folder)
+    cameras = {number: dataclasses.replace(camera, params=camera.params + np.array([0, 0, pixels, 0]))
+               for number, camera in model.cameras.items()}
+    io.write_colmap(model.folder, dataclasses.replace(model, cameras=cameras), text=True)
+    return folder
+
+
+def test_where_the_models_program_had_its_principal_points_is_seen(run, tmp_path, capsys):
+    scene = shifted_scene(run.scene, str(tmp_path / "scene"), 4.0)
+    assert read_colmap_layout(scene, run).train[0].camera.cx == 20
+    words = [ply_of(run), "--scene", scene, "--budget", "40", "--iterations", "20", "--resolution", "30", "--quiet"]
+    assert main(["simplify", *words, "-o", str(tmp_path / "out")]) == 0
+    assert TrainConfig.load(str(tmp_path / "out")).principal_point == "centre"
+    assert main(["simplify", *words, "-o", str(tmp_path / "out"), "--resume"]) == 0
+    assert main(["simplify", *words, "-o", str(tmp_path / "asked"), "--principal-point", "scene"]) == 0
+    assert TrainConfig.load(str(tmp_path / "asked")).principal_point == "scene"
+    capsys.readouterr()
+    assert main(["train", scene, "--init", ply_of(run), "-o", str(tmp_path / "init"), "--iterations", "2",
+                 "--resolution", "30", "--quiet"]) == 0
+    assert "note: with --principal-point centre it has" in capsys.readouterr().out
+
+
+def test_the_fewest_that_lose_no_more(run, tmp_path, monkeypatch):
+    count = results_of(run.output)[0]["num_gaussians"]
+    tried = []
+
+    class Measured:
+        def __init__(self, number):
+            self.metrics, self.fps = {"psnr": 30 - 10 * (1 - number / count), "ssim": 1.0}, None
+
+    def figures(renderer, views, device, passes):
+        return Measured(renderer.model.num_gaussians)
+
+    def trained(config, *arguments, **options):
+        tried.append(config.budget)
+        return train(config, *arguments, **options)
+
+    monkeypatch.setattr(module, "evaluate", figures)
+    monkeypatch.setattr(module, "train", trained)
+    output = str(tmp_path / "out")
+    row = simplify(run.output, output, loses=5.0, iterations=4, progress=False)
+    assert tried == sorted(tried) and row["num_gaussians"] == tried[-1] == results_of(output)[0]["num_gaussians"]
+    assert 0.5 * count <= tried[-1] < 0.5 * 1.5 * count, "half of them lose 5 dB; numbers grow by a half"
+    assert tried[-2] < 0.5 * count and row["start"]["psnr"] == 30
+    begun = tried[-2]
+    tried.clear()
+    train(TrainConfig.load(output).changed(budget=begun, iterations=4), overwrite=True, progress=False)
+    assert simplify(run.output, output, loses=5.0, iterations=4, progress=False, resume=True) == {
+        **row, "train_seconds": pytest.approx(0, abs=60), "fps": pytest.approx(0, abs=1e6)}
+    assert tried[0] == begun, "a resumed search goes on where it was"
+
+
+@pytest.mark.parametrize("options, words", [
+    ({}, "give one of --budget N, --keep PART and --loses DB"),
+    ({"budget": 5, "keep": 0.5}, "give one of"),
+    ({"budget": 10**6}, "--budget is 1000000; it must be at most"),
+    ({"budget": 3}, "--budget is 3; it must be at least 4"),
+    ({"keep": 0.0}, "--keep is 0.0; it must be above 0 and at most 1"),
+    ({"keep": 1.5}, "--keep is 1.5"),
+    ({"loses": -1.0}, "--loses is -1.0; it must be at least 0"),
+    ({"budget": 40, "iterations": 1}, "--iterations is 1; it must be a whole number of at least 4"),
+    ({"budget": 40, "scene": "/nowhere"}, "scene /nowhere: no such folder"),
+])
+def test_bad_input_is_told_and_nothing_is_written(run, tmp_path, options, words):
+    with pytest.raises((ConfigError, TrainerError)) as error:
+        simplify(run.output, str(tmp_path / "out"), progress=False, **options)
+    assert words in str(error.value) and not (tmp_path / "out").exists()
+
+
+def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
+    output, ply = str(tmp_path / "out"), str(tmp_path / "model.ply")
+    stored = io.read_gaussians(ply_of(run))
+
+    def fails(model, *words):
+        for command in (["simplify", model, "--budget", "40"], ["train", run.scene, "--init", model]):
+            given = [word for word in words if command[0] == "simplify" or word not in ("--scene", run.scene)]
+            assert main([*command, "-o", output, *given, "--device", "cpu"]) == 1
+            text = capsys.readouterr().err
+            assert text.count("\n") == 1 and not os.path.exists(output)
+        return text
+
+    scene = ["--scene", run.scene]
+    assert "no such file or folder; name a .ply, .splat, .spz or .glb" in fails(str(tmp_path / "no.ply"), *scene)
+    assert "no model is in it: neither config.json" in fails(str(tmp_path))
+    logits = stored.opacity_logits.copy()
+    logits[0], logits[4] = np.nan, np.inf
+    io.write_gaussians(ply, dataclasses.replace(stored, opacity_logits=logits))
+    assert (f"2 of its {len(logits):,} Gaussians have a number that is NaN or infinite; `dsmoe export MODEL -o "
+            "clean.glb`") in fails(ply, *scene)
+    io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]]))
+    assert "does not show" in fails(ply, *scene) and "at least 15" in fails(ply, *scene)
+    main(["simplify", ply, "--budget", "40", "-o", output])
+    assert "neither photographs nor cameras are known; name its scene with --scene" in capsys.readouterr().err
+    (tmp_path / "bare").mkdir()
+    bare = model_folder(run, tmp_path / "bare", cameras=False)
+    main(["simplify", bare, "--budget", "40", "-o", output])
+    assert "neither photographs nor cameras are known" in capsys.readouterr().err and not os.path.exists(output)
+
+
+@pytest.mark.parametrize("edit, words", [
+    (lambda entry: entry.pop("fx"), "'fx' is missing"),
+    (lambda entry: entry.update(rotation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "is no rotation"),
+    (lambda entry: entry.update(position=[0, float("nan"), 0]), "must be finite"),
+    (lambda entry: entry.update(width=0), "must be above 0"),
+    (lambda entry: entry.update(img_name="view_002.png"), "two cameras have one `img_name`"),
+])
+def test_wrong_cameras_are_named(run, tmp_path, edit, words):
+    folder = model_folder(run, tmp_path)
+    path = tmp_path / "cameras.json"
+    entries = json.loads(path.read_text())
+    edit(entries[0])
+    path.write_text(json.dumps(entries))
+    with pytest.raises(TrainerError) as error:
+        read_layout(TrainConfig(scene=folder))
+    assert words in str(error.value) and "cameras.json" in str(error.value)
+
+
+def test_ctrl_c_keeps_the_model_and_resume_ends_where_it_would_have(run, tmp_path, monkeypatch, capsys):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    words = ["simplify", run.output, "--budget", "40", "--iterations", "40", "--quiet", "--device", "cpu"]
+    straight, broken = str(tmp_path / "straight"), str(tmp_path / "broken")
+    assert main([*words, "-o", straight]) == 0
+    step = Trainer.step
+
+    def interrupted(self, *arguments):
+        if self.iteration + 1 == 9:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, *arguments)
+
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "step", interrupted)
+            assert main([*words, "-o", broken]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err.endswith("interrupted; continue it with --resume\n")
+    assert main(["export", broken, "-o", str(tmp_path / "sofar.ply")]) == 0
+    assert 40 < len(io.read_gaussians(tmp_path / "sofar.ply").means3D), "the checkpoint's"
+    assert main([*words, "-o", broken, "--resume"]) == 0
+    assert open(model_path(broken, 40), "rb").read() == open(model_path(straight, 40), "rb").read()
+    assert "start" in results_of(broken)[0]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_training_from_a_model_begins_with_its_image(run, degree):
+    """With fewer harmonics it is what they show, with more the others begin with 0."""
+    config = run.changed(init=ply_of(run), sh_degree=degree)
+    scene = load_scene(config, progress=False)
+    trainer = Trainer(config, scene)
+    assert trainer.model.active_sh_degree == min(degree, 1)
+    assert trainer.model.raw["shs"].shape[1] == (degree + 1) ** 2 - 1
+    gaussians = io.read_gaussians(ply_of(run))
+    cut = raw_of(dataclasses.replace(gaussians, shs=gaussians.shs[:, :3 * min(degree, 1)]))
+    expected = open_renderer(run, ply_of(run), None, "cpu").of(GaussianModel.from_gaussians(cut, min(degree, 1)), 1.0)
+    camera = scene.test[0].camera
+    with torch.no_grad():
+        assert torch.equal(trainer.renderer(camera).color, expected(camera).color)
+
+
+@pytest.mark.parametrize("strategy", ["3dgs", "steady", "mcmc", "importance"])
+def test_every_strategy_starts_from_a_model(run, tmp_path, strategy):
+    count = results_of(run.output)[0]["num_gaussians"]
+    config = run.changed(strategy=strategy, init=ply_of(run), budget=count + 10, iterations=30, densify_until_iter=20,
+                         densify_from_iter=2, densification_interval=4, output=str(tmp_path / "out"))
+    row = train(config, progress=False)
+    assert 0 < row["num_gaussians"] <= count + 10 and row["protocol"]["init_points"] == count
+    if strategy != "importance":
+        with pytest.raises(ConfigError, match=f"--budget is {count - 1}; with --strategy {strategy} it must be at"):
+            train(config.changed(budget=count - 1, output=str(tmp_path / "no")), progress=False)
+
+
+def test_a_resumed_run_finds_the_model_that_it_began_with(run, tmp_path):
+    model = str(tmp_path / "model.ply")
+    shutil.copyfile(ply_of(run), model)
+    config = run.changed(init=model, iterations=6, output=str(tmp_path / "out"), densify_until_iter=0)
+    train(config, progress=False)
+    longer = config.changed(iterations=8)
+    stored = io.read_gaussians(model)
+    io.write_gaussians(model, dataclasses.replace(stored, means3D=stored.means3D + np.float32(0.5)))
+    with pytest.raises(TrainerError, match="checksum of the points"):
+        train(longer, resume=True, progress=False)
+    shutil.copyfile(ply_of(run), model)
+    assert train(longer, resume=True, progress=False)["protocol"]["iterations"] == 8
+
+
+@pytest.mark.parametrize("mode", BLEND_MODES)
+def test_a_glb_is_read_as_it_was_written(run, tmp_path, mode):
+    gate = 0.25 if mode in ("smoe", "smoe_eq7") else None
+    model = dataclasses.replace(io.read_gaussians(ply_of(run)), blend_mode=mode, background_gate=gate, comments=())
+    ply, glb = str(tmp_path / "m.ply"), str(tmp_path / "m.glb")
+    io.write_gaussians(ply, model)
+    assert main(["export", ply, "-o", glb]) == 0
+    read = read_start(glb)
+    assert (read.blend_mode, read.background_gate) == (mode, {"alpha": 1}.get(mode, gate or 0))
+    turned = model.rotations / np.linalg.norm(model.rotations, axis=1, keepdims=True)
+    for name, expected, error in (("means3D", model.means3D, 0), ("dc", model.dc, 0), ("shs", model.shs, 0),
+                                  ("rotations", turned, 1e-6), ("log_scales", model.log_scales, 1e-5),
+                                  ("opacity_logits", model.opacity_logits.clip(-11, 11), 2e-2)):
+        actual = getattr(read.gaussians, name)  # logs and logits of float32; near 1 an opacity has few digits
+        assert np.allclose(actual.clip(-11, 11) if name == "opacity_logits" else actual, expected, rtol=0, atol=error)
+
+
+def test_a_splat_is_read_as_its_bytes_say(run, tmp_path):
+    splat = str(tmp_path / "m.splat")
+    assert main(["export", run.output, "-o", splat]) == 0
+    read, model = read_start(splat).gaussians, io.read_gaussians(ply_of(run))
+    opacity = 1 / (1 + np.exp(-model.opacity_logits.astype(np.float64)))
+    order = np.argsort(-np.exp(model.log_scales.astype(np.float64)).prod(axis=1) * opacity[:, 0], kind="stable")
+    assert read.sh_degree == 0 and np.array_equal(read.means3D, model.means3D[order])
+    assert np.allclose(read.log_scales, model.log_scales[order], atol=1e-5)
+    assert np.abs(1 / (1 + np.exp(-read.opacity_logits)) - opacity[order]).max() <= 0.51 / 255
+    colour = (0.5 + 0.28209479177387814 * model.dc[order]).clip(0, 1)  # 1 / (2 sqrt(pi))
+    assert np.abs(0.5 + 0.28209479177387814 * read.dc - colour).max() <= 0.51 / 255
+    unit = model.rotations[order] / np.linalg.norm(model.rotations[order], axis=1, keepdims=True)
+    assert np.abs(read.rotations - unit).max() <= 1.01 / 128
+    for content in (b"", b"\0" * 33):
+        (tmp_path / "bad.splat").write_bytes(content)
+        with pytest.raises(TrainerError, match=f"{len(content)} bytes; a .splat has 32 for each Gaussian"):
+            read_start(str(tmp_path / "bad.splat"))
+
+
+def test_an_spz_is_read_to_the_bits_of_the_format(run, tmp_path):
+    pytest.importorskip("gsply", reason="pip install gsply")
+    spz = str(tmp_path / "m.spz")
+    assert main(["export", run.output, "-o", spz]) == 0
+    read, model = read_start(spz).gaussians, io.read_gaussians(ply_of(run))
+    assert np.allclose(read.means3D, model.means3D, rtol=0, atol=2.0**-18)
+    assert np.allclose(read.log_scales, model.log_scales, atol=0.51 / 16)
+    assert np.allclose(read.shs, model.shs, atol=0.51 / 128)
+
+
+def test_what_is_no_glb_of_gaussians_is_named(tmp_path):
+    path = str(tmp_path / "m.glb")
+    for content in (b"", b"glTF" + bytes(40), Image.new("RGB", (2, 2)).tobytes() * 9):
+        with open(path, "wb") as file:
+            file.write(content)
+        with pytest.raises(TrainerError, match="m.glb: "):
+            read_start(path)
