@@ -140,7 +140,8 @@ def _backward(ctx, *gradients):
     inputs, images, saved = kept[:count], kept[count:count + _NUM_IMAGES], kept[count + _NUM_IMAGES:]
     by_input = _input_gradients(ctx, list(ctx.needs_input_grad[:_NUM_INPUTS]), gradients, inputs, images, saved,
                                 _OPS.rasterize_backward)
-    return (*by_input, *(None for _ in OPTIONS))
+    # torch wants a gradient of the structure of each argument: of a list a list.
+    return (*by_input, *([None] * len(option) if isinstance(option, (list, tuple)) else None for option in ctx.options))
 
 
 def _refuse_second_derivative(ctx, *gradients):
@@ -237,7 +238,7 @@ def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
     return _fake_gradients(inputs, present, others[-1])
 
 
-def _fake_mark_visible(positions, viewmatrix, near, camera_model):
+def _fake_mark_visible(positions, viewmatrix, near, camera_model=0):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
 
 

@@ -73,6 +73,21 @@ class Footprints(NamedTuple):
         """Those of a radius above 0, in their order. The host waits for their number."""
         return self.rows(self.radii.nonzero().squeeze(1))
 
+    def around(self, width: int) -> Footprints:
+        """Those of an equirectangular image of this width, and the footprints that cross its seam on both sides of it.
+
+        The second copy of a footprint follows the others, moved by the width. Radii count 3 sigma: what lies beyond is
+        still cut. The host waits for the number of copies.
+        """
+        left = ((self.radii > 0) & (self.gates[:, 0] < self.radii)).nonzero().squeeze(1)
+        right = ((self.radii > 0) & (self.gates[:, 0] > width - 1 - self.radii)).nonzero().squeeze(1)
+        parts = [self]
+        for index, step in ((left, width), (right, -width)):
+            shift = self.gates.new_tensor([step, *[0] * (GATE_NUMBERS - 1)])
+            copies = self.rows(index)
+            parts.append(copies._replace(gates=copies.gates + shift))
+        return Footprints.joined(parts)
+
     @staticmethod
     def joined(parts: Sequence[Footprints]) -> Footprints:
         """All footprints of several parts, one part behind the other."""

@@ -308,7 +308,7 @@ TEST(ProjectGaussian, RadiusIsPositiveExactlyWhereTheFootprintMeetsTheImage) {
       }
       const Gaussian<double> gaussian = load_gaussian(scene.inputs(), 0);
       const auto view = transform_point(camera.view, gaussian.mean);
-      const auto conic = covariances(gaussian, camera, view, scene.config.projection_rules()).conic;
+      const auto conic = covariances(gaussian, ByMatrix<double>{camera}, view, scene.config.projection_rules()).conic;
       const auto pixel = project_to_pixel(camera, gaussian.mean);
       bool expected = false;
       if (mode != BlendMode::kSmoeEq7) {  // x range of Inria's rectangle against 3 columns of tiles; y is on the image

@@ -25,6 +25,7 @@ from diff_smoe_rasterization.footprints import image_numbers
 from diff_smoe_rasterization.settings import (
     _FIXED_GATES,
     BLEND_MODES,
+    CAMERA_MODELS,
     FEATURE_OUTPUTS,
     OUTPUTS,
     GaussianRasterizationSettings,
@@ -179,8 +180,8 @@ def test_build_info_tells_what_runs():
 
 def test_the_settings_and_the_op_have_the_same_fields():
     """A setting is a line of csrc/torch/fields.h and a field of this name; these options are no settings."""
-    options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward"}
-    fields = set(GaussianRasterizationSettings._fields)
+    options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward", "lens"}
+    fields = set(GaussianRasterizationSettings._fields) - {"distortion", "principal_point"}  # which are `lens`
     assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
     assert fields - options <= set(_core.inputs) and options <= fields
 
@@ -191,6 +192,10 @@ def test_the_blend_modes_have_the_numbers_and_the_background_gates_of_the_core()
     assert {name: facts["background_gate"] for name, facts in modes.items()} == _FIXED_GATES
     below = {mode: resolve_faint_below(mode, None) for mode in BLEND_MODES}
     assert {name: round(facts["faint_below"], 6) for name, facts in modes.items()} == below  # a float32
+
+
+def test_the_camera_models_have_the_numbers_of_the_core():
+    assert _core.camera_models == CAMERA_MODELS
 
 
 @on_every_device

@@ -236,6 +236,23 @@ def test_both_halves_of_a_rendering(lens):
     assert_all_close(halves, whole, 1e-5)  # sums over tiles are rounded once more
 
 
+def test_footprints_across_the_seam_are_drawn_on_both_sides():
+    """As if the camera looked elsewhere: a turn of 180 degrees moves the image by half its width."""
+    width, height = 64, 32
+    scene = lens_scene("smoe", "equirectangular").to(torch.float32)
+    turned = scene.settings.viewmatrix.clone()
+    turned[:, (0, 2)] *= -1
+    images = []
+    for view in (scene.settings.viewmatrix, turned):
+        settings = scene.settings._replace(viewmatrix=view, image_width=width, image_height=height)
+        prints = project_gaussians(settings=settings, **scene.inputs)
+        whole = prints.around(width)
+        assert len(whole.radii) > len(prints.radii) == len(scene.inputs["means3D"])
+        images.append([blend_footprints(each, settings).color for each in (whole, prints)])
+    assert_close(images[1][0].roll(width // 2, 2), images[0][0], 1e-3, "color")  # beyond 3 sigma little is left
+    assert (images[1][1].roll(width // 2, 2) - images[0][1]).abs().max() > 0.05, "a seam without the copies"
+
+
 def test_a_batch_takes_views_of_different_models():
     scene = lens_scene("smoe", "fisheye").to(torch.float32)
     views = [scene.settings] + [scene.settings._replace(**{"distortion": (), "principal_point": None, **lens})
