@@ -316,23 +316,15 @@ def lens_points(points, view, settings):
     """The same of a lens. The Jacobian is torch's own derivative. A depth is NaN beyond the lens's range."""
     del points
     model, numbers = settings.camera_model, [float(number) for number in settings.distortion]
-    width, height = settings.image_width, settings.image_height
-    focal = view.new_tensor([width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)])
-    principal = settings.principal_point or (width / 2, height / 2)
-    if model == "equirectangular":
-        focal, principal = view.new_tensor([width / (2 * math.pi), height / math.pi]), (width / 2, height / 2)
-    principal = view.new_tensor(principal)
-
-    def on_image(plane):
-        return focal * distorted(plane, model, numbers) + principal - 0.5
-
+    size = settings.image_width, settings.image_height
+    focal, principal, on_image = _image(view, settings)
     keeps_graph = torch.is_grad_enabled()
     with torch.enable_grad():
         view = view if view.requires_grad else view.detach().requires_grad_()
         plane, seen = on_plane(view, model, numbers)
         position = on_image(plane)
         if model == "opencv":  # the Jacobian is taken at most FRUSTUM_MARGIN times the image's slopes off axis
-            limits = focal.new_tensor(slope_limits(numbers, focal.tolist(), principal.tolist(), (width, height)))
+            limits = focal.new_tensor(slope_limits(numbers, focal.tolist(), principal.tolist(), size))
             slopes = plane.clamp(-limits, limits)
             by_slope = [torch.autograd.grad(row.sum(), slopes, create_graph=True)[0]
                         for row in on_image(slopes).unbind(1)]
@@ -342,9 +334,30 @@ def lens_points(points, view, settings):
         else:
             jacobian = torch.stack([torch.autograd.grad(row.sum(), view, create_graph=True)[0]
                                     for row in position.unbind(1)], 1)
-        depth = view.norm(dim=1) if model in SEES_AROUND else view[:, 2]
-        depth = depth.masked_fill(~seen, math.nan)
+        depth = _depths(view, model).masked_fill(~seen, math.nan)
     return (position, depth, jacobian) if keeps_graph else (position.detach(), depth.detach(), jacobian.detach())
+
+
+def positions_and_depths(view, settings):
+    """Returns both of a lens, [n, 2] and [n], without asking what the lens sees. view: [n, 3]."""
+    model, numbers = settings.camera_model, [float(number) for number in settings.distortion]
+    return _image(view, settings)[2](on_plane(view, model, numbers)[0]), _depths(view, model)
+
+
+def _image(view, settings):
+    """Returns focal lengths and principal point [2], and the function from a lens's plane to pixels."""
+    width, height = settings.image_width, settings.image_height
+    focal = view.new_tensor([width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)])
+    principal = settings.principal_point or (width / 2, height / 2)
+    if settings.camera_model == "equirectangular":
+        focal, principal = view.new_tensor([width / (2 * math.pi), height / math.pi]), (width / 2, height / 2)
+    principal = view.new_tensor(principal)
+    numbers = [float(number) for number in settings.distortion]
+    return focal, principal, lambda plane: focal * distorted(plane, settings.camera_model, numbers) + principal - 0.5
+
+
+def _depths(view, model):
+    return view.norm(dim=1) if model in SEES_AROUND else view[:, 2]
 
 
 SEES_AROUND = ("fisheye", "thin_prism_fisheye", "equirectangular")  # their depth is the distance
