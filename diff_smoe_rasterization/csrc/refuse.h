@@ -153,9 +153,16 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
   refuse_negative(function, "near", camera.near);
   refuse_negative(function, "scale_modifier", frame.config.scale_modifier);
   refuse_negative(function, "low_pass", frame.config.low_pass);
+  const bool pinhole = camera.lens.model == LensModel::kPinhole;
+  if (!pinhole) {
+    refuse_unless_positive(function, "camera.lens.focal.x", camera.lens.focal.x);
+    refuse_unless_positive(function, "camera.lens.focal.y", camera.lens.focal.y);
+  }
   if constexpr (kOnHost<Frame>) {
     refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", camera.view);
-    refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
+    if (pinhole) {
+      refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
+    }
     const bool read = frame.inputs.dc != nullptr || frame.inputs.shs != nullptr;
     for (int i = 0; read && i < 3; ++i) refuse_unless_finite(function, "camera.position (campos)", camera.position, i);
   } else {

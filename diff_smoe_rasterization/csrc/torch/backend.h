@@ -150,7 +150,8 @@ template <class Core> struct Backend : Core {
     return own;
   }
 
-  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {
+  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near,
+                        int64_t camera_model) {
     const Tensor visible = empty({positions.size(0)}, positions, kBool);
     dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
@@ -159,6 +160,7 @@ template <class Core> struct Backend : Core {
       frame.inputs.means3D = positions.data_ptr<S>();
       Core::set_view(frame.camera, view.data_ptr<S>());
       frame.camera.near = static_cast<float>(near);
+      frame.camera.lens.model = static_cast<LensModel>(camera_model);
       Core::mark_visible(frame, visible.data_ptr<bool>());
     });
     return visible;

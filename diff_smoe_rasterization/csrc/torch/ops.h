@@ -24,7 +24,8 @@ template <class Backend> Inputs checked(const char* function, const Inputs& inpu
   const Inputs dense = contiguous(inputs);
   if (options.strict) refuse_non_finite(function, dense);
   if (options.prefiltered) {
-    refuse_culled(function, dense, Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], options.near));
+    refuse_culled(function, dense,
+                  Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], options.near, options.camera_model));
   }
   return dense;
 }
@@ -331,7 +332,7 @@ struct BatchArguments {
     const auto type = inputs[kMeans3D].scalar_type();
     DSMOE_CHECK_TYPE(type == kFloat, function, ": means3D is ", dtype_name(type), "; it must be float32");
     for (int64_t v = 0; v < num_views(); ++v) {
-      take_view(v);
+      take_view(function, v);
       check_arguments(function, inputs, options);
     }
     return inputs[kMeans3D].device();
@@ -341,12 +342,14 @@ struct BatchArguments {
   template <class Backend> typename Backend::ViewBatch batch(const char* function) {
     typename Backend::ViewBatch batch;
     for (int64_t v = 0; v < num_views(); ++v) {
-      take_view(v);
+      take_view(function, v);
       inputs = checked<Backend>(function, inputs, options);
       kept.insert(kept.end(), inputs.begin() + kViewMatrix, inputs.begin() + kViewMatrix + kTensorsOfCamera);
-      const auto frame = Backend::template frame_of_gaussians<float>(inputs, options, Images());
-      batch.inputs = frame.inputs, batch.config = frame.config;
-      batch.views.emplace_back().camera = frame.camera;
+      as_op(function, [&] {
+        const auto frame = Backend::template frame_of_gaussians<float>(inputs, options, Images());
+        batch.inputs = frame.inputs, batch.config = frame.config;
+        batch.views.emplace_back().camera = frame.camera;
+      });
     }
     return batch;
   }
@@ -380,14 +383,18 @@ struct BatchArguments {
   }
 
   // Puts the camera and the image of a view among the arguments.
-  void take_view(int64_t v) {
+  void take_view(const char* function, int64_t v) {
     std::copy_n(cameras.begin() + v * kTensorsOfCamera, kTensorsOfCamera, inputs.begin() + kViewMatrix);
     const double* image = images.data() + v * kNumbersOfImage;
     options.image_width = static_cast<int64_t>(image[0]), options.image_height = static_cast<int64_t>(image[1]);
     options.tanfovx = image[2], options.tanfovy = image[3];
+    options.camera_model = static_cast<int64_t>(image[4]);
+    DSMOE_CHECK_VALUE(image[5] >= 0 && image[5] <= kMostLensNumbers, function, ": images says that a lens has ",
+                      image[5], " numbers; it must have 0 to ", kMostLensNumbers);
+    options.lens.assign(image + 6, image + 6 + static_cast<int>(image[5]));
   }
 
-  static constexpr size_t kTensorsOfCamera = 3, kNumbersOfImage = 4;
+  static constexpr size_t kTensorsOfCamera = 3;
   Inputs inputs;
   Options options;
   Tensors cameras;
@@ -460,12 +467,13 @@ template <class Backend> void project_rows_backward(Arguments& arguments) {
   arguments.give_back_with_list({means2D}, std::move(results));
 }
 
-template <class Backend> Tensor mark_visible(const Tensor& positions, const Tensor& viewmatrix, double near) {
+template <class Backend>
+Tensor mark_visible(const Tensor& positions, const Tensor& viewmatrix, double near, int64_t camera_model) {
   const Expect expect("markVisible", "positions", positions);
   expect("positions", positions, {"N", 3});
   expect("viewmatrix", viewmatrix, {4, 4});
   const typename Backend::Guard guard(positions.device());
-  return Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), near);
+  return Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), near, camera_model);
 }
 
 template <class Backend> void register_ops(Library& m) {

@@ -65,7 +65,8 @@ const std::string kProjectBackward =
     kOptions + "bool[] wanted) -> Tensor[]";
 
 // The first half for a batch of V views (params.h), whose arguments are those of the first view but for the cameras:
-// viewmatrix, projmatrix and campos of each view, and width, height, tanfovx and tanfovy of each. float32.
+// viewmatrix, projmatrix and campos of each view. images: kNumbersOfImage of each: width, height, tanfovx, tanfovy,
+// camera_model, how many numbers its lens has, and these, filled up with anything. float32.
 const std::string kBatch = kInputs + kOptions + "Tensor[] cameras, float[] images";
 
 // radii [V, N] and offsets [V, blocks + 1] int32: the last offset of a view says how many rows it has.
@@ -95,5 +96,5 @@ DSMOE_LIBRARY(m) {
   m.def(kCountRows.c_str());
   m.def(kProjectRows.c_str());
   m.def(kProjectRowsBackward.c_str());
-  m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");
+  m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near, int camera_model=0) -> Tensor");
 }
