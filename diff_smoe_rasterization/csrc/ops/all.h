@@ -9,6 +9,7 @@
 #include "ops/image_loss/op.h"
 #include "ops/importance/op.h"
 #include "ops/neighbors/op.h"
+#include "ops/view_rows/op.h"
 
 namespace dsmoe {
 namespace binding {
@@ -22,6 +23,7 @@ template <class Backend, class Ops> void all_ops(Ops ops) {
   image_loss_ops<Backend>(ops);
   importance_ops<Backend>(ops);
   neighbors_ops<Backend>(ops);
+  view_rows_ops<Backend>(ops);
 }
 
 }  // namespace binding

@@ -24,13 +24,14 @@
 namespace dsmoe {
 namespace binding {
 
-// The options of a rendering in a schema, without a comma at the end.
+// The tensors and the options of a rendering in a schema.
+#define DSMOE_ARGUMENT(first, schema, name, ...) schema " " #name ", "
+inline std::string inputs_in_schema() { return DSMOE_INPUTS(DSMOE_ARGUMENT); }
 inline std::string options_in_schema() {
-#define DSMOE_ARGUMENT(type, schema, name) schema " " #name ", "
   const std::string list = DSMOE_OPTIONS(DSMOE_ARGUMENT);
-#undef DSMOE_ARGUMENT
-  return list.substr(0, list.size() - 2);
+  return list.substr(0, list.size() - 2);  // without the last comma
 }
+#undef DSMOE_ARGUMENT
 
 inline Inputs read_inputs(Arguments& arguments) {
   Inputs inputs;
@@ -72,6 +73,22 @@ inline Saved read_saved(Arguments& arguments) {
 // Calls body(S()) with the type of `like`, as the op `function`.
 template <class Body> void dispatch(const char* function, const Tensor& like, Body body) {
   as_op(function, [&] { dispatch_real(like, body); });
+}
+
+// What an op that projects asks of the values of its arguments. Returns them dense.
+template <class Backend> Inputs checked(const char* function, const Inputs& inputs, const Options& options) {
+  if (options.debug) {
+    for (int i = kBackground; i <= kBackgroundGate; ++i) {
+      refuse_nan(std::string(function) + ": " + kInputNames[i], inputs[i]);
+    }
+  }
+  const Inputs dense = contiguous(inputs);
+  if (options.strict) refuse_non_finite(function, dense);
+  if (options.prefiltered) {
+    refuse_culled(function, dense,
+                  Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], options.near, options.camera_model));
+  }
+  return dense;
 }
 
 // Says that there are the ops.

@@ -64,24 +64,6 @@ const std::string kProjectBackward =
     "Tensor radii, " +
     kOptions + "bool[] wanted) -> Tensor[]";
 
-// The first half for a batch of V views (params.h), whose arguments are those of the first view but for the cameras:
-// viewmatrix, projmatrix and campos of each view. images: kNumbersOfImage of each: width, height, tanfovx, tanfovy,
-// camera_model, how many numbers its lens has, and these, filled up with anything. float32.
-const std::string kBatch = kInputs + kOptions + "Tensor[] cameras, float[] images";
-
-// radii [V, N] and offsets [V, blocks + 1] int32: the last offset of a view says how many rows it has.
-const std::string kCountRows = "count_rows(" + kBatch + ") -> (Tensor radii, Tensor offsets)";
-
-// Fills gates [M, 8] and features [M, 4] of each view.
-const std::string kProjectRows =
-    "project_rows(" + kBatch + ", Tensor(a!) radii, Tensor offsets, Tensor(b!)[] gates, Tensor(c!)[] features) -> ()";
-
-// records: [M, 9] of each view. dL_dmeans2D: [V, N, 3], written where the radius is above 0. gradients: those by the
-// Gaussians that the arguments hold, but for means2D, in their order, summed over the views.
-const std::string kProjectRowsBackward =
-    "project_rows_backward(" + kBatch +
-    ", Tensor radii, Tensor offsets, Tensor[] features, Tensor[] records) -> (Tensor dL_dmeans2D, Tensor[] gradients)";
-
 }  // namespace
 
 DSMOE_LIBRARY(m) {
@@ -93,8 +75,5 @@ DSMOE_LIBRARY(m) {
   m.def(kProjectBackward.c_str());
   m.def(kBlend.c_str());
   m.def(kBlendBackward.c_str());
-  m.def(kCountRows.c_str());
-  m.def(kProjectRows.c_str());
-  m.def(kProjectRowsBackward.c_str());
   m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near, int camera_model=0) -> Tensor");
 }
