@@ -82,7 +82,7 @@ class Splats:
                                            *self._options))
 
     def gate_map(self) -> GateMap:
-        """Finds the Gaussian with the largest gate in each pixel, and the median one; the background is no candidate.
+        """Finds each pixel's Gaussian of the largest gate, and the median one; the background is not a candidate.
 
         The alpha image, if it was asked for, must be as it was rendered. The same bits from call to call. On CUDA the
         host does not wait.

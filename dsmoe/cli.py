@@ -60,24 +60,25 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        output = getattr(arguments, "output", None) or ""
-        continues = os.path.isfile(os.path.join(output, CHECKPOINT_NAME))
-        hint = f"; continue it with: {_resume_command(output)}" if continues and arguments.command == "train" else ""
-        if continues and arguments.command == "simplify":
-            hint = "; the same command with --resume continues"
+        trains = arguments.command in ("train", "simplify")
+        continues = trains and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
+        hint = f"; continue it with: {_resume_command(arguments)}" if continues else ""
         if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return exit_status(stop)
 
 
-def _resume_command(output: str) -> str:
+def _resume_command(arguments: argparse.Namespace) -> str:
     """What to type to continue an interrupted training."""
-    words = [command(), "train", "--resume", "-o", shlex.quote(output)]
+    if arguments.command == "simplify":
+        given = [word for word in arguments.command_words if word not in ("--resume", "--overwrite")]
+        return " ".join([command(), *map(shlex.quote, given), "--resume"])
+    words = [command(), "train", "--resume", "-o", shlex.quote(arguments.output)]
     size = os.environ.get("WORLD_SIZE", "1")
     if size == "1":
         return " ".join(words)
-    if os.environ.get("LOCAL_WORLD_SIZE") == size and TrainConfig.load(output).device == "cuda":
+    if os.environ.get("LOCAL_WORLD_SIZE") == size and TrainConfig.load(arguments.output).device == "cuda":
         return " ".join([*words, "--gpus", size])
     return " ".join([*words, "(by torchrun, as before)"])
 
@@ -229,7 +230,7 @@ def _simplify(arguments: argparse.Namespace) -> None:
     from .results.modelfile import model_path
     from .results.rows import results_table, viewer_warning
     from .simplify import simplify
-    from .system.process import command, set_up_process
+    from .system.process import set_up_process
 
     arguments.device = getattr(arguments, "device", "auto")
     _choose_device(arguments)

@@ -59,8 +59,11 @@ def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, A
     """Options that depend on the scene, of those whose names are not given. Raises SceneError if it cannot be read."""
     from .scenes.images import has_transparency
     from .scenes.scene import read_layout
+    from .starting import read_start
     from .training.importance_strategy import reached_from
 
+    if config.init:  # it keeps its number
+        return {} if config.budget else {"budget": read_start(config.init).count}
     layout, numbers = read_layout(config), NUMBERS[config.device]
     chosen: Dict[str, Any] = {}
     points = len(layout.points.subset(config.init_points, config.seed).positions)
@@ -72,7 +75,7 @@ def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, A
             wanted = min(max(numbers.per_point * points, numbers.least), numbers.most)
         chosen["budget"] = min(wanted, reached_from(config, points))
     if (config.background_gate == LEARNED and "background_gate_start" not in given
-            and has_transparency(layout.train[0].path)):
+            and not layout.model and has_transparency(layout.train[0].path)):
         # Empty space shows the background; a gate that starts low takes most of a short training to rise.
         chosen["background_gate_start"] = learned_gate_of("smoe_eq7")["background_gate_start"]
     return chosen

@@ -23,7 +23,7 @@ def check(path: str, **options: Any) -> int:
     applied = "".join(f", --{option}" for option in planned.applied)
     print(f"{path}: {planned.state}" + (f" ({planned.trainer}{applied})" if planned.trainer else ""))
     sys.stdout.writelines(f"  {line}\n" for line in (*planned.reasons, *planned.notes))
-    return 0 if planned.state in ("patchable", "patched") else 1
+    return 0 if planned.state in ("patchable", "patched", "supported") else 1
 
 
 def diff(path: str, **options: Any) -> int:

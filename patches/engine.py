@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import importlib.util
 import os
 import re
 import shutil
@@ -15,8 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Set, Union
 
-from . import facts, kernels
+from . import facts, kernels, run
 from .rules import OPTIONS, SETTINGS, entries_in, import_rasterizer, rules_of, settings_blend, start
+from .runtime import STAND_INS
 from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, leftover, tree_of, unpatched
 from .trainers import GR, INTEGRATIONS, OF_AUTHORS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
@@ -25,6 +27,8 @@ OF_PROCESS = re.compile(re.escape(UNFINISHED) + r"\w{8}\.(\d+)")  # the whole na
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
 CALLS = r"|\b(?:chosen_blend|default_(?:blend|smoe)|(?:saved_)?(?:blend|smoe)_of)\("  # nowhere imported without it
+PIP_NAMES = {"cv2": "opencv-python-headless", "PIL": "pillow", "skimage": "scikit-image", "sklearn": "scikit-learn",
+             "yaml": "pyyaml"}  # of packages that are installed by another name
 PathLike = Union[str, Path]
 
 
@@ -32,7 +36,7 @@ class Plan(NamedTuple):
     """What `apply` would do, and why it would not. Files are by name, relative to the checkout."""
 
     root: Path
-    state: str  # unknown, unpatchable, patchable, patched, half-patched or drifted
+    state: str  # unknown, supported (by `dsmoe run`), unpatchable, patchable, patched, half-patched or drifted
     trainer: Optional[str]
     reasons: Sequence[str]  # of the state, as lines
     applied: Sequence[str] = ()  # of OPTIONS, those that the files on disk are patched with
@@ -45,8 +49,9 @@ class Plan(NamedTuple):
 
     def possible(self) -> Plan:
         """Returns the plan. Raises PatchError if the checkout cannot be patched."""
-        if self.state in ("unknown", "unpatchable", "drifted"):
+        if self.state in ("unknown", "supported", "unpatchable", "drifted"):
             trainer = f" ({self.trainer})" if self.trainer else ""
+            trainer += ", but not by a patch" * (self.state == "supported")
             raise PatchError("\n  ".join([f"the checkout is {self.state}{trainer}:", *self.reasons]))
         return self
 
@@ -150,7 +155,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         return Plan(root, "unknown", None, [f"{blends}: {facts.STILL}"], applied)
     if chosen is None or facts.those(found, "uses "):
         instead = [] if "type `dsmoe run" in reason or below else [_instead(before, found)]
-        return Plan(root, "unknown", None, [reason, *instead], applied)
+        state = "supported" if "type `dsmoe run" in reason and _runs(root, before) else "unknown"
+        return Plan(root, state, None, [reason, *instead], applied)
     wanted = {"modernise": modernise, "fuse": fuse}
     options = [name for name in OPTIONS if wanted[name] or name in applied]
     sparse_adam = facts.is_for_sparse_adam(root, before, found)
@@ -183,11 +189,33 @@ def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
             "the order of its results, such as color,depth,radii")
 
 
+def _script_of(files: Mapping[str, bytes]) -> str:
+    trains = [name for name, data in files.items() if b"def training(" in data and b"__main__" in data]
+    return min(trains or ["train.py"], key=lambda name: (name.count("/"), name != "train.py", name))
+
+
 def _by_run(files: Mapping[str, bytes]) -> str:
     """Says how a checkout is run without a patch."""
-    trains = [name for name, data in files.items() if b"def training(" in data and b"__main__" in data]
-    script = min(trains or ["train.py"], key=lambda name: (name.count("/"), name != "train.py", name))
-    return f"type `dsmoe run --blend-mode smoe -- python {script} ...` in it, which needs none"
+    return f"type `dsmoe run --blend-mode smoe -- python {_script_of(files)} ...` in it, which needs none"
+
+
+def _runs(root: Path, files: Mapping[str, bytes]) -> bool:
+    """Whether `dsmoe run` takes what `_by_run` says."""
+    with contextlib.suppress(PatchError):
+        run.prepare(["python", str(root / _script_of(files))], "smoe", None, {})
+        return True
+    return False
+
+
+def _missing(files: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> List[str]:
+    """Says what the trainer's scripts import that neither the checkout nor this environment has."""
+    needed = facts.needed_packages(facts.reached(files, [GR, *(entry.file for entry in trainer.entries)]))
+    ours = {path.name for path in STAND_INS.iterdir()}  # under --modernise
+    own = {part.partition(".")[0] for name in files for part in name.split("/")} | {RASTERIZER}
+    missing = {name for name in needed - own if importlib.util.find_spec(name) is None}
+    lines = {f"pip install {' '.join(PIP_NAMES.get(name, name) for name in sorted(missing - ours))}": missing - ours,
+             "--modernise brings this package's": missing & ours if "modernise" not in options else set()}
+    return [f"not installed here: {', '.join(sorted(names))}; {remedy}" for remedy, names in lines.items() if names]
 
 
 def diff(path: PathLike, **options: Any) -> str:
@@ -209,7 +237,10 @@ def apply(path: PathLike, **options: Any) -> Plan:
     planned = check(path, **options).possible()
     todo = {name: data for name, data in planned.after.items() if data != planned.now[name]}
     _write(planned.root, todo, planned.now)
-    return planned._replace(written=bool(todo))
+    by_name = {one.name: one for one in TRAINERS}
+    missing = _missing(planned.before, by_name[str(planned.trainer)], [
+        name for name in OPTIONS if options.get(name) or name in planned.applied])
+    return planned._replace(written=bool(todo), notes=[*planned.notes, *missing])
 
 
 def revert(path: PathLike) -> List[str]:

@@ -55,7 +55,7 @@ def of_checkout(files: Mapping[str, bytes], script: str = "") -> Set[str]:
     made up while they run, every file that imports one counts.
     """
     scripts = [name for name, data in files.items() if "/" not in name and b"def training(" in data]
-    found = of_files(_reached(files, [script] if script in files else [*LOOKED_AT, *scripts] * (GR in files)))
+    found = of_files(reached(files, [script] if script in files else [*LOOKED_AT, *scripts] * (GR in files)))
     others = {name: data for name, data in files.items() if IMPORTS_RASTERIZER.search(data)}
     return found if calls_some(found) else found | of_files(others)
 
@@ -70,7 +70,7 @@ def packages(facts: Set[str]) -> Set[str]:
     return (those(facts, "from ") | those(facts, "renamed ")) - {OF_GSPLAT}
 
 
-def _reached(files: Mapping[str, bytes], start: Sequence[str]) -> Dict[str, bytes]:
+def reached(files: Mapping[str, bytes], start: Sequence[str]) -> Dict[str, bytes]:
     """Returns the files that those of `start` import, and they themselves. Packages bring their __init__.py."""
     reached: Dict[str, bytes] = {}
     waiting, folders = list(start), {"", *(name.rpartition("/")[0] for name in start)}  # for a script's imports
@@ -98,10 +98,20 @@ def _modules(node: ast.AST) -> List[Tuple[int, str]]:
     return []
 
 
+def needed_packages(files: Mapping[str, bytes]) -> Set[str]:
+    """Returns the packages that files import as they begin, whatever else happens."""
+    needed: Set[str] = set()
+    for data in files.values():
+        with contextlib.suppress(PatchError):
+            needed |= {module.partition(".")[0] for line in tree_of(data).body for level, module in _modules(line)
+                       if not level}
+    return needed
+
+
 def of_files(files: Mapping[str, bytes]) -> Set[str]:
     """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "returns color, radii".
 
-    files: those of a checkout, by name. One that is no Python shows nothing: a rule will say so.
+    files: those of a checkout, by name. One that is not Python shows nothing: a rule will say so.
     """
     return set().union(*_of_each(files).values())
 

@@ -27,7 +27,7 @@ from diff_smoe_rasterization.settings import (
 )
 
 STAND_INS = Path(__file__).resolve().parent / "stand_ins"
-OPTIONS = ("blend_mode", "background_gate", "faint_below")  # as cfg_args records them; the last one is no flag
+OPTIONS = ("blend_mode", "background_gate", "faint_below")  # as cfg_args records them; the last one is not a flag
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
@@ -144,6 +144,7 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
         if value is not None and before not in (None, value):
             _warn(f"{dataset.model_path}/cfg_args is of a run with {option} {before}, but this one has {value}; a "
                   f"training overwrites it. To go on as before, give --{option} {before}")
+    _warn_of_no_kernels()
     settings.blend_of_process = mode, gate, faint  # the patch's line in the renderer may be deleted
     dataset.blend_mode, dataset.background_gate = mode, gate
     if faint is None:
@@ -178,6 +179,7 @@ def _say_rasterizer(flavour: str) -> None:
     mode = resolve_blend_mode(None)
     gate = f", background gate {settings.resolve_background_gate(mode, None)}" if mode in GATED_MODES else ""
     say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
+    _warn_of_no_kernels()
 
     def look(*_: Any) -> None:
         used = os.environ.get(USED_VARIABLE, "")  # until the first rendering of this process
@@ -250,8 +252,27 @@ def gsplat_of_run() -> None:
         for module in ("gsplat", "gsplat.rendering", "gsplat.relocation", "gsplat.strategy.ops"):
             if hasattr(sys.modules.get(module), name):
                 setattr(sys.modules[module], name, function)
+    for module in filter(None, map(sys.modules.get, ("gsplat", "gsplat.rendering"))):
+        for name in [name for name in vars(module) if name.startswith("rasterization_")]:
+            setattr(module, name, _refusing(name))  # which a trainer may call by its options alone
     keep_records()
     _say_rasterizer("gsplat")
+
+
+def _refusing(name: str) -> Callable[..., Any]:
+    """Returns what stands for a rasterizer of gsplat's that this package has not."""
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise NotImplementedError(f"dsmoe run: the trainer calls gsplat's {name}, which this package has not; choose "
+                                  "gsplat's rasterization in the trainer's options, or run it without dsmoe run")
+
+    return refuse
+
+
+def _warn_of_no_kernels() -> None:
+    """Where torch sees a GPU and this build has no kernels: what pip said of that while it built is hidden."""
+    from dsmoe.system.device import why_no_gpu
+    if importlib.import_module("torch").cuda.is_available() and why_no_gpu():
+        _warn(f"the GPU cannot be used: {why_no_gpu()}")
 
 
 def is_installed(module: str) -> bool:

@@ -60,4 +60,6 @@ def describe() -> str:
         lines["built with torch"] = info.get("torch_built_with", "unknown")
     gpus = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
     lines["GPU"] = ", ".join(gpus) if gpus else "none that torch can use"
+    if gpus and lines.get("backends", "").startswith("cpu;"):
+        lines["GPU"] += "; NOT USED: this build has no kernels for it. DSMOE_BUILD_CUDA=1 pip install . builds them"
     return "\n".join(f"{name:<26}{text}" for name, text in lines.items())

@@ -102,7 +102,7 @@ def test_the_command_says_in_one_line_that_nothing_was_built(copied_package):
     info = run("info")
     assert info.returncode == 0
     assert re.search("^extension +not usable: .*not built.*pip install.*$", info.stdout, re.MULTILINE)
-    train = run("train", "scene", "-o", "out", "--blend-mode", "smoe")
+    train = run("train", ".", "-o", "out", "--blend-mode", "smoe")
     assert train.returncode == 1
     assert re.fullmatch("dsmoe train: error: .*not built.*pip install.*\n", train.stderr)
     # What computes nothing works without it.
@@ -177,7 +177,7 @@ def test_build_info_tells_what_runs():
 
 
 def test_the_settings_and_the_op_have_the_same_fields():
-    """A setting is a line of csrc/torch/fields.h and a field of this name; these options are no settings."""
+    """A setting is a line of csrc/torch/fields.h and a field of this name; these options are not settings."""
     options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward"}
     fields = set(GaussianRasterizationSettings._fields)
     assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
@@ -231,7 +231,7 @@ def test_images_may_be_edited_in_place(mode, outputs):
 
 @on_every_device
 def test_radii_changed_in_place_before_backward_are_noticed(mode):
-    """They are no image, and say which Gaussians have a gradient."""
+    """They are not an image, and say which Gaussians have a gradient."""
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32).requiring_grad()
     rendering = rasterize(settings=scene.settings, **scene.inputs)
     rendering.radii.fill_(1)
@@ -546,3 +546,34 @@ def test_debug_names_the_image_gradient_that_holds_nan():
     gradient[2, 3, 4] = float("nan")
     with pytest.raises(RuntimeError, match=r"rasterize_backward: dL_dcolor\[2, 3, 4\] is NaN"):
         color.backward(gradient)
+
+
+class OnGpu(torch.Tensor):
+    """A tensor that says so, as where torch has CUDA and this build has no kernels."""
+
+    @property
+    def device(self):
+        return torch.device("cuda:0")
+
+
+def on_gpu(*shape):
+    return torch.zeros(*shape).as_subclass(OnGpu)
+
+
+@pytest.mark.parametrize("name, call", [
+    ("rasterize", lambda package: package.rasterize(on_gpu(4, 3), on_gpu(4), random_scene("alpha", 4, 8, 8).settings)),
+    ("markVisible", lambda package: package.GaussianRasterizer(random_scene("alpha", 4, 8, 8).settings).markVisible(
+        on_gpu(4, 3))),
+    ("distCUDA2", lambda package: package.distCUDA2(on_gpu(4, 3))),
+    ("fused_ssim", lambda package: package.fused_ssim(on_gpu(1, 3, 8, 8), on_gpu(1, 3, 8, 8))),
+    ("SparseGaussianAdam.step", lambda package: package.SparseGaussianAdam(
+        [torch.nn.Parameter(torch.zeros(4, 3))], lr=0.1, eps=1e-8).step(on_gpu(4).bool().as_subclass(OnGpu), 4))])
+def test_a_build_without_kernels_says_why_where_it_is_given_a_tensor_on_a_gpu(name, call, monkeypatch):
+    """Whichever function a trainer calls first: pip hides what the build said."""
+    for module in ("extension", "arguments"):
+        monkeypatch.setattr(importlib.import_module(f"diff_smoe_rasterization.{module}"), "BACKENDS", ("cpu",))
+    monkeypatch.setattr(importlib.import_module("diff_smoe_rasterization.checks"), "has_kernels", lambda: False)
+    monkeypatch.setattr(importlib.import_module("diff_smoe_rasterization.extension"), "build_info",
+                        lambda: {"without_cuda_because": "no GPU was seen"})
+    with pytest.raises(TypeError, match=rf"^{name}: \w+ is on cuda:0; this build renders on cpu: no GPU was seen$"):
+        call(importlib.import_module("diff_smoe_rasterization"))

@@ -98,7 +98,7 @@ template <class S> struct SumBounds {
   int width, height;             // of the image, pixels
   RasterConfig<S> config;        // the background is read
   SavedForward<S> saved;         // projected and features are read
-  const int32_t* radii;          // [N] pixels; 0 if the rest means nothing
+  const int32_t* radii;          // [N] pixels; 0: the other arrays hold nothing for this Gaussian
   ImageGradients<S> dL_dimages;  // any may be null
   int32_t* gradients;            // [F + 1] exponents of the largest dL/dfeature and dL/dgate_sum
   int32_t* features;             // [feature_stride(F)] of the largest features; both are below every exponent before

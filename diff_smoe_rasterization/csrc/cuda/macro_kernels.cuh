@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kListBlock)
   int64_t slot = static_cast<int64_t>(shared_before + before);
 #pragma unroll 1
   for (int r = 0; r < kListedPerLane; ++r) {
-    // Registers are no arrays to a loop that is not unrolled.
+    // Registers are not arrays to a loop that is not unrolled.
     int32_t gaussian = gaussians[0];
     MacroRect rect = rects[0];
 #pragma unroll

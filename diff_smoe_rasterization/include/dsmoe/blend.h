@@ -183,7 +183,7 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
     const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
     if constexpr (kTInNumerator) {
       auto pair = transmit_backward<AnyGate::kClamps>(pixel, logit, kSuffixAboutBase ? value - pixel.base : value);
-      pair.power = select(contributes, pair.power, zero);  // logit is 0 then, but u may be no number
+      pair.power = select(contributes, pair.power, zero);  // logit is 0 then, but u may be NaN
       if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
     }

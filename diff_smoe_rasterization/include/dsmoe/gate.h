@@ -97,7 +97,7 @@ template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> i
 template <class Real> DSMOE_HD Real clamped(Real logit) { return min(logit, Real(Scalar<Real>(kAlphaMax))); }
 
 template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
-  // If the exponent is above 0 the conic is no ellipse. Such a pair does not count, and must not overflow either.
+  // If the exponent is above 0 the conic is not an ellipse. Such a pair does not count, and must not overflow either.
   const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
@@ -132,7 +132,7 @@ template <class S> struct LogGate {
     return max(least, min(S(kLog2AlphaCut), max(S(kLog2CoreAlpha), greatest + S(kLog2CoreKernel))));
   }
 
-  // If log_logit is above log2(o) the conic is no ellipse. Such a pair does not count. least: of a pair that counts.
+  // Above log2(o) the conic is not an ellipse. Such a pair does not count. least: the least logit that counts.
   template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit, Real least) const {
     Gate<Real> gate;
     gate.logit = exp2(log_logit);

@@ -9,6 +9,7 @@ import re
 import stat
 import struct
 import threading
+import warnings
 
 import numpy as np
 import pytest

@@ -429,7 +429,7 @@ def test_the_readme_has_every_trainer_rule_and_state():
         assert {rule.name for rule in rules_of(trainer, {}, False)} <= set(cells)
         assert all(f"`{rule.function}`" in text for rule in trainer.entries)
     assert all(f"## --{option}\n" in text for option in OPTIONS)
-    assert "says patchable, patched, half-patched, drifted, unpatchable or unknown" in text
+    assert "says patchable, patched, half-patched, drifted, unpatchable, supported or unknown" in text
 
 
 def test_a_folder_of_the_users_stays(tmp_path):
@@ -455,4 +455,27 @@ def test_where_no_patch_fits_dsmoe_run_is_named(tmp_path):
     early = patches.check(make(tmp_path / "early", {GR: RENDERER.replace("debug=pipe.debug  # slow", "")}))
     assert early.state == "unpatchable" and "dsmoe run --blend-mode smoe -- python train.py" in early.reasons[-1]
     flat = patches.check(make(tmp_path / "flat", {GR: None, "train.py": RENDERER + "def training(): pass\n"}))
-    assert flat.state == "unknown" and any("dsmoe run --blend-mode smoe -- python" in line for line in flat.reasons)
+    assert flat.state == "supported" and any("dsmoe run --blend-mode smoe -- python" in line for line in flat.reasons)
+
+
+def test_what_dsmoe_run_takes_is_supported(tmp_path, dsmoe):
+    """And only that: the same rasterizer beside another one that is always imported is not."""
+    mip = RENDERER.replace("bg=bg_color", "bg=bg_color, kernel_size=0.1")
+    said = dsmoe("patch", "check", make(tmp_path / "mip", {GR: mip}))
+    assert said.status == 0 and "mip: supported\n" in said.out and "type `dsmoe run" in said.out
+    refused(tmp_path / "mip", "the checkout is supported, but not by a patch:", "for which there is no patch: type")
+    two = make(tmp_path / "two", {GR: mip + "from diff_surfel_rasterization import GaussianRasterizer as Other\n"})
+    said = dsmoe("patch", "check", two)
+    assert said.status == 1 and ": unknown\n" in said.out
+
+
+def test_imports_that_are_missing_are_named_once_patched(tmp_path):
+    """Of the scripts and what they import; not what is tried, is of the checkout, or comes with the patch."""
+    train = "import cv2_no, utils.own, torch, fused_ssim\ntry:\n    import wandb_no\nexcept ImportError: pass\n" + TRAIN
+    files = {"train.py": train, "utils/own.py": "from yaml_no import load\nimport helper\n", "utils/helper.py": "",
+             "alone.py": "import alone_no\n"}
+    assert patches.apply(make(tmp_path, files)).notes[-2:] == [
+        "not installed here: cv2_no, yaml_no; pip install cv2_no yaml_no",
+        "not installed here: fused_ssim; --modernise brings this package's"]
+    assert patches.apply(tmp_path, modernise=True).notes[-1].startswith("not installed here: cv2_no, yaml_no; ")
+    assert not patches.apply(make(tmp_path / "plain")).notes

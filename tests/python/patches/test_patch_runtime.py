@@ -9,10 +9,12 @@ from collections import namedtuple
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings, settings
 from diff_smoe_rasterization.settings import GATED_MODES, resolve_blend
 from dsmoe.patches import runtime
+from dsmoe.system import device
 
 ALPHA = {"blend_mode": "alpha", "background_gate": None}
 
@@ -167,6 +169,18 @@ def test_one_line_says_which_mode_it_is(capsys):
     printed = capsys.readouterr()
     said = ["blend mode alpha\n", "blend mode smoe, background gate learned\n"]
     assert printed.out == "" and printed.err.split("diff_smoe_rasterization: ")[1:] == said
+
+
+@pytest.mark.parametrize("gpu, why", [(True, "no nvcc"), (True, None), (False, "no GPU")])
+def test_a_gpu_for_which_there_are_no_kernels_is_named(gpu, why, monkeypatch):
+    """The trainer may ask for it only after it has read its images."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    monkeypatch.setattr(device, "why_no_gpu", lambda: why)
+    with warned("the GPU cannot be used: no nvcc$" if gpu and why else None):
+        runtime.blend_of(run("alpha"))
+    runtime.say.cache_clear()
+    with warned("the GPU cannot be used: no nvcc$" if gpu and why else None):
+        runtime._say_rasterizer("inria")
 
 
 def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):

@@ -73,7 +73,8 @@ def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, res
     said = {"kernel_size": f"its rasterizer is mip_splatting, {run}",
             "inv_depth": f"its rasterizer is color,radii,inverse_depth, {run}",
             "blur": "its GaussianRasterizationSettings have blur, which no rasterizer has that is known here"}
-    refused(tmp_path, "unknown", next((said[name] for name in said if name in renderer),
+    runs = "kernel_size" in renderer or "inv_depth" in renderer
+    refused(tmp_path, "supported" if runs else "unknown", next((said[name] for name in said if name in renderer),
                                       f"its rasterizer returns {count} "), "type `dsmoe run --blend-mode smoe ")
 
 
@@ -91,7 +92,8 @@ COMPRESS = TRAIN.replace("training(dataset, opt, pipe,", "run_vq(model_params, o
 
 @pytest.mark.parametrize("name, files, entries", [
     ("scaffold-gs", {GR: RENDERER + VISIBLE, "train.py": TRAIN + RENDERING}, {"train.py": 2, "render.py": 1}),
-    ("hac", {GR: RENDERER + VISIBLE, "train.py": "import utils.encodings\n" + TRAIN + RENDERING, "render.py": None},
+    ("hac", {GR: RENDERER + VISIBLE, "train.py": "import utils.encodings\n" + TRAIN + RENDERING, "render.py": None,
+             "utils/encodings.py": ""},
      {"train.py": 2}),
     ("c3dgs", {GR: RENDERER.replace("prefiltered=False,", "clamp_color=True,"), "train.py": None,
                "compress.py": COMPRESS}, {"compress.py": 1, "render.py": 1})])

@@ -1,6 +1,7 @@
 """The `dsmoe` command from end to end, on a tiny ray-traced scene."""
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import errno
 import json
@@ -162,7 +163,10 @@ def test_the_whole_command_continues_a_training_of_several_processes(tiny_config
         tiny_config.changed(device=device).save(tiny_config.output)
         monkeypatch.setenv("WORLD_SIZE", processes)
         monkeypatch.setenv("LOCAL_WORLD_SIZE", here)
-        assert cli._resume_command(tiny_config.output).endswith(said)
+        assert cli._resume_command(argparse.Namespace(command="train", output=tiny_config.output)).endswith(said)
+    words = ["simplify", "a b", "-o", "o", "--overwrite"]
+    simplify = argparse.Namespace(command="simplify", output="o", command_words=words)
+    assert cli._resume_command(simplify).endswith(" simplify 'a b' -o o --resume")
 
 
 @pytest.mark.parametrize("words, said", [

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 from dsmoe.cli import main
 from dsmoe.errors import TrainerError
 from dsmoe.short_run import short_flags, train_command
-from dsmoe.system import device
+from dsmoe.system import device, environment
 from dsmoe.system.device import chosen_device, device_line, device_to_train_on
 
 
@@ -78,3 +79,14 @@ def test_commands_say_their_device_first(tiny_scene, tmp_path, capsys, monkeypat
     monkeypatch.setenv("DSMOE_DEVICE", "tpu")  # is not asked for if a run has its own
     assert main(["train", tiny_scene, "--resume", "-o", run, *short]) == 0
     assert main(["train", "--resume", "-o", run, "--device", "auto", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("built, cards, words", [
+    (False, ["a card"], "a card; NOT USED: this build has no kernels for it. DSMOE_BUILD_CUDA=1 pip install"),
+    (True, ["a card"], "a card$"), (False, [], "none that torch can use$")])
+def test_info_says_which_gpu_is_not_used(built, cards, words, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: len(cards))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda index: cards[index])
+    monkeypatch.setattr(environment, "extension_info", lambda: {"cuda_built": built, "without_cuda_because": "no nvcc"})
+    text = environment.describe()
+    assert re.search(f"(?m)^GPU +{words}", text) and ("cpu; no cuda (no nvcc)" in text) != built

@@ -318,7 +318,7 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
 
 @pytest.mark.parametrize("edit, words", [
     (lambda entry: entry.pop("fx"), "'fx' is missing"),
-    (lambda entry: entry.update(rotation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "is no rotation"),
+    (lambda entry: entry.update(rotation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "is not a rotation"),
     (lambda entry: entry.update(position=[0, float("nan"), 0]), "must be finite"),
     (lambda entry: entry.update(width=0), "must be above 0"),
     (lambda entry: entry.update(img_name="view_002.png"), "two cameras have one `img_name`"),
@@ -352,7 +352,7 @@ def test_ctrl_c_keeps_the_model_and_resume_ends_where_it_would_have(run, tmp_pat
             assert main([*words, "-o", broken]) == 130
     finally:
         signal.signal(signal.SIGINT, before)
-    assert capsys.readouterr().err.endswith("interrupted; the same command with --resume continues\n")
+    assert capsys.readouterr().err.endswith(f"-o {broken} --resume\n")
     assert main(["export", broken, "-o", str(tmp_path / "sofar.ply")]) == 0
     assert 40 < len(io.read_gaussians(tmp_path / "sofar.ply").means3D), "the checkpoint's"
     assert main([*words, "-o", broken, "--resume"]) == 0
