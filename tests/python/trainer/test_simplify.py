@@ -119,9 +119,8 @@ def test_removals_begin_at_once_and_nothing_grows(run):
     assert grows.growth_ends == 107 and grows.removals[0] == 109, "8 / 15 and 8.2 / 15"
 
 
-def test_what_no_view_needs_goes_first(run, monkeypatch):
+def test_what_no_view_needs_goes_first(run):
     """As far as the budget allows."""
-    monkeypatch.setattr("dsmoe.training.importance_strategy.DROPS_UNNEEDED", True)
     scene = load_scene(run.changed(init=ply_of(run)), progress=False)
     gaussians = scene.start.gaussians
     means = gaussians.means3D.copy()
