@@ -82,7 +82,7 @@ WORDS = {
     "docs/tools.md": 450, "docs/trainer.md": 1350, "docs/trainers.md": 630, "docs/usage.md": 1450,
     "examples/README.md": 180, "examples/libtorch/README.md": 200, "integrations/README.md": 1180,
     "patches/README.md": 1200}
-ALL_WORDS = 30200  # of all pages together; the sum of WORDS is what they come down to
+ALL_WORDS = 30900  # of all pages together; the sum of WORDS is what they come down to
 
 
 def test_the_pages_together_stay_short(stage):
