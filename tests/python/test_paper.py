@@ -119,6 +119,6 @@ def test_the_edge_has_the_figures_of_the_pages(tmp_path):
     by_picture = [float(value) for value in re.findall(r"([\d.]+) dB", run("edge.py", folder=tmp_path))[:2]]
     assert said == pytest.approx(by_picture, abs=0.3)
     rules = [float(value) for value in re.findall(r"([\d.]+) dB", run("edge.py", "--rules", folder=tmp_path))]
-    rows = rows_of(PAPER.read_text(encoding="utf-8"), "(?:0.25|1)")
+    rows = rows_of(PAPER.read_text(encoding="utf-8"), r"(?:0\.25|1), 600")
     of_page = [float(value) for row in rows for value in re.findall(r"\d\d\.\d", row)]
     assert len(rules) == len(of_page) == 8 and of_page == pytest.approx(rules, abs=0.5)
