@@ -36,6 +36,16 @@ def test_each_piece_of_the_paper_has_a_row_with_a_command(first):
     assert re.search(r"`(dsmoe|--blend-mode)", row)
 
 
+def test_every_command_of_the_readme_is_one():
+    from dsmoe.arguments import build_parser
+
+    typed = [" ".join(words).split(" && ") for words in commands((ROOT / "README.md").read_text(encoding="utf-8"))
+             if words[0] == "dsmoe" and len(words) > 2]  # a name is no command
+    assert len(typed) > 10
+    for command in (command for line in typed for command in line):
+        build_parser().parse_args(command.split()[1:])
+
+
 def test_every_command_of_the_map_is_one():
     from dsmoe.arguments import build_parser
     from dsmoe.bench.names import SCENES, SHIPPED
