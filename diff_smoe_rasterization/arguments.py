@@ -43,7 +43,7 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
         options = [kind(value) for value, (_, kind) in zip(given, _SETTING_OPTIONS)]
     except (TypeError, ValueError, OverflowError, RuntimeError):
         options = None
-    # What is as it was given is no text, which float() and bool() take, and has lost no digits.
+    # Unchanged by conversion: so it was not a string (float() and bool() take those) and lost no digits.
     if options != given or not all([-_WHOLE_LIMIT < options[place] < _WHOLE_LIMIT for place in _WHOLE_OPTIONS]):
         for (name, kind), value in zip(_SETTING_OPTIONS, given):
             if not _fits(kind, value):
@@ -81,7 +81,7 @@ _WHOLE_OPTIONS = [place for place, (_, kind) in enumerate(_SETTING_OPTIONS) if k
 def tensor_checks(function, first_name, first):
     """Returns functions that pass a required and an optional tensor on, and refuse what torch cannot dispatch.
 
-    Those are values that are no tensors and tensors on different devices; the ops refuse wrong shapes and types.
+    Those are values that are not tensors and tensors on different devices; the ops refuse wrong shapes and types.
     function: the one that errors name. first: the tensor on whose device all others have to be.
     """
     def required(name, value):

@@ -110,7 +110,7 @@ def once_differentiable(function):
 
 
 def _remember(ctx, inputs, options, radii):
-    """Notes the arguments that are no tensors, and that radii have no gradient. Returns the tensors that were given."""
+    """Notes the arguments that are not tensors, and that radii have no gradient. Returns the given tensors."""
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(radii)
     ctx.options = options

@@ -28,7 +28,7 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
     K, R and t are tensors, arrays or lists. The matrices have gradients with respect to R, t and, in the projection, K.
 
     Returns: GaussianRasterizationSettings. Raises ValueError if a shape does not fit, K has skew or focal lengths
-    that are not positive, R is no rotation, or a blend mode is not known.
+    that are not positive, R is not a rotation, or a blend mode is not known.
     """
     resolve_blend_mode(options.get("blend_mode"))  # refused if it is given, not at the first rendering
     dtype = dtype or (torch.float32 if bg is None else bg.dtype)

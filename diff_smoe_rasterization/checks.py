@@ -17,7 +17,7 @@ def has_kernels() -> bool:
 
 
 def check_tensor(function: str, name: str, value: Any) -> None:
-    """Raises TypeError if a named argument of a function is no dense tensor."""
+    """Raises TypeError if a named argument of a function is not a dense tensor."""
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
     if value.layout is not torch.strided:
@@ -34,7 +34,7 @@ def refuse_device(function: str, name: str, value: torch.Tensor) -> NoReturn:
 
 
 def check_tensors(function: str, **values: Any) -> None:
-    """Raises TypeError if one of the named arguments of a function is no dense tensor, or on another device."""
+    """Raises TypeError if one of the named arguments of a function is not a dense tensor, or on another device."""
     first_name, device = "", None
     for name, value in values.items():
         check_tensor(function, name, value)

@@ -58,6 +58,7 @@ class ProcessGate:
     def reset(self, frozen: bool = False) -> None:
         """Begins at START. frozen: it is that of a trained model, which `found` will say, and is never stepped."""
         self.frozen = frozen
+        self.renders = False  # whether anything was rendered, with this gate or another
         self.blend_mode: Optional[str] = None  # of the last rendering with this gate; None: there was none
         self._found: Optional[float] = None  # what a file said of it, until it is stepped
         self._adam: Dict[str, Any] = {}
@@ -216,6 +217,7 @@ gate = ProcessGate()
 def gate_of(background_gate: Any, blend_mode: str, tensors: Iterable[torch.Tensor],
             means3D: Optional[torch.Tensor] = None) -> Any:
     """Returns what a rendering takes for a resolved background gate: itself, or for LEARNED `gate.of_rendering`."""
+    gate.renders = True
     if isinstance(background_gate, str):
         return gate.of_rendering(blend_mode, [tensor for tensor in tensors if tensor is not None], means3D)
     return background_gate

@@ -86,7 +86,7 @@ class GaussianRasterizationSettings(NamedTuple):
     debug: bool = False  # look for NaN in images and gradients, and for raw values; slower. Attributes: `strict`
     antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
     near: float = 0.2  # Gaussians with view depth <= near are culled
-    # SMoE modes: also skip alpha below this; 0 is the paper's rule. `smoe`: pairs below this are no strong ones
+    # SMoE modes: also skip alpha below this; 0 is the paper's rule. `smoe`: pairs below this are not strong ones
     alpha_min: float = 0.0
     strict: bool = False  # raise if an attribute is NaN or infinite, instead of culling that Gaussian
     blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
@@ -203,7 +203,7 @@ def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
 
     None means that of the process, else the environment variable DSMOE_FAINT_BELOW, for callers that cannot be edited,
     else the mode's own.
-    Raises ValueError for what is no number of 0 or more, or a greater one than MAX_BACKGROUND_GATE.
+    Raises ValueError for what is not a number of 0 or more, or a greater one than MAX_BACKGROUND_GATE.
     """
     if faint_below is None and blend_of_process is not None:
         faint_below = blend_of_process[2]

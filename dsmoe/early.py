@@ -60,14 +60,14 @@ def check_source(source: str, besides: str = "") -> None:
 
 
 def check_scene(folder: str) -> None:
-    """Raises SceneError if it is no folder."""
+    """Raises SceneError if it is not a folder."""
     if not is_folder(folder):
         is_one = "is a file; a scene is a folder" if is_file(folder) else "no such folder"
         raise SceneError(f"scene {folder}: {is_one}")
 
 
 def check_photos(photos: str) -> None:
-    """Raises SceneError if it is no folder."""
+    """Raises SceneError if it is not a folder."""
     if is_folder(photos):
         return
     if not is_file(photos):

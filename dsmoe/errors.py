@@ -14,7 +14,7 @@ def printable(text: str) -> str:
 
 
 def print_any_name() -> None:
-    """Lets this process print what its streams cannot encode, such as file names that are no UTF-8."""
+    """Lets this process print what its streams cannot encode, such as file names that are not UTF-8."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             is_utf = stream.encoding.lower().startswith("utf")
@@ -42,7 +42,7 @@ def said_of(error: BaseException) -> str:
 
 
 def in_one_line(error: BaseException) -> Optional[str]:
-    """What a command prints of an error in place of a traceback; None if the error is no user's."""
+    """What a command prints of an error in place of a traceback; None if the error is not a user's."""
     if isinstance(error, OSError) and error.strerror:  # whose text begins with a number
         return printable(f"{os.fsdecode(error.filename)}: {error.strerror}" if error.filename else error.strerror)
     if isinstance(error, (TrainerError, ImportError, OSError)):

@@ -113,7 +113,7 @@ def photo_names(folder: str, output: str, say: Callable[[str], None] = lambda te
     found = [name for name in names if name.lower().endswith(ENDINGS)]
     strange = next((name for name in found if not is_file(os.path.join(folder, name))), None)
     if strange:
-        raise SceneError(f"{os.path.join(folder, strange)}: is no file that can be read (a pipe, a device, or a link "
+        raise SceneError(f"{os.path.join(folder, strange)}: cannot be read as a file (a pipe, a device, or a link "
                          "to one or to nothing); remove it")
     video = next((name for name in names if name.lower().endswith(VIDEO_ENDINGS)), None)
     hint = f"{video} is a video; {FROM_VIDEO}" if video else ""

@@ -13,8 +13,8 @@ class Preset(NamedTuple):
     """Options in place of defaults; those that are given win."""
 
     iterations: int
-    until: float  # densify_until_iter, as a part of the iterations
     settings: str  # of --strategy-options
+    parts: Dict[str, float] = {}  # options that are these parts of the iterations
     options: Dict[str, Any] = {}
 
 
@@ -28,9 +28,10 @@ class Numbers(NamedTuple):
     most_points: int  # to start from
 
 
-FAST = {"cuda": Preset(7000, 0.35, "overshoot=1.5,removals=4"),
-        "cpu": Preset(3000, 0.35, "overshoot=1.5,removals=4")}  # growth and removals early: much is left to settle
-BEST = Preset(60_000, 0.5, "views=255", {"scaling_lr": 0.02})
+# Growth and removals are early: much is left to settle.
+FAST = {"cuda": Preset(7000, "overshoot=1.5,removals=4", {"densify_until_iter": 0.35}),
+        "cpu": Preset(3000, "overshoot=1.5,removals=4", {"densify_until_iter": 0.35})}
+BEST = Preset(60_000, "views=255", options={"scaling_lr": 0.02})
 PRESETS = {"fast": FAST, "best": {"cuda": BEST, "cpu": BEST}}
 NUMBERS = {"cuda": Numbers(3, 20_000, 300_000, 100_000, 1_000_000),
            "cpu": Numbers(1, 10_000, 60_000, 20_000, 100_000)}
@@ -51,16 +52,20 @@ def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Di
     given = options.get("strategy_options", "")
     named = {part.partition("=")[0].strip() for part in given.split(",")}
     settings = [part for part in preset.settings.split(",") if part.partition("=")[0] not in named]
-    return {**preset.options, "iterations": iterations, "densify_until_iter": max(2, round(preset.until * iterations)),
-            **options, "strategy_options": ",".join(filter(None, [given, *settings]))}
+    parts = {name: max(2, round(part * iterations)) for name, part in preset.parts.items()}
+    return {**preset.options, **parts, "iterations": iterations, **options,
+            "strategy_options": ",".join(filter(None, [given, *settings]))}
 
 
 def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, Any]:
     """Options that depend on the scene, of those whose names are not given. Raises SceneError if it cannot be read."""
     from .scenes.images import has_transparency
     from .scenes.scene import read_layout
+    from .starting import read_start
     from .training.importance_strategy import reached_from
 
+    if config.init:  # it keeps its number
+        return {} if config.budget else {"budget": read_start(config.init).count}
     layout, numbers = read_layout(config), NUMBERS[config.device]
     chosen: Dict[str, Any] = {}
     points = len(layout.points.subset(config.init_points, config.seed).positions)
@@ -72,7 +77,7 @@ def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, A
             wanted = min(max(numbers.per_point * points, numbers.least), numbers.most)
         chosen["budget"] = min(wanted, reached_from(config, points))
     if (config.background_gate == LEARNED and "background_gate_start" not in given
-            and has_transparency(layout.train[0].path)):
+            and not layout.model and has_transparency(layout.train[0].path)):
         # Empty space shows the background; a gate that starts low takes most of a short training to rise.
         chosen["background_gate_start"] = learned_gate_of("smoe_eq7")["background_gate_start"]
     return chosen

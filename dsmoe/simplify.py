@@ -135,7 +135,7 @@ def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], No
     quality = check_start(scene, config)
     if finds_center and quality.centred > quality.psnr:
         scene, config = scene.centred(), config.changed(principal_point="centre")
-    if say:
+    if say and scene.kind != "model":  # which agrees with itself
         say(quality.text(config))
     return _Measured(start, start_renderer(start, config), scene, config)
 
@@ -177,6 +177,7 @@ def _figures(measured: _Measured) -> Dict[str, Any]:
     """The model's own, for the row."""
     evaluation: Evaluation = evaluate(measured.renderer, measured.scene.to(measured.config.device).test,
                                       measured.config.device, passes=1)
+    metrics = {name: None if measured.scene.kind == "model" else value for name, value in evaluation.metrics.items()}
     return {"blend_mode": measured.start.blend_mode, "background_gate": measured.start.background_gate,
-            **evaluation.metrics, "num_gaussians": measured.start.count, "train_seconds": None, "fps": evaluation.fps,
+            **metrics, "num_gaussians": measured.start.count, "train_seconds": None, "fps": evaluation.fps,
             "bytes": os.path.getsize(measured.start.path)}

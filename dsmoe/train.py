@@ -239,7 +239,7 @@ def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = F
             earlier.check_continued_by(config)
         record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
     if os.path.lexists(models) and not os.path.isdir(models):
-        raise TrainerError(f"{models} is no folder; a run writes its model there")
+        raise TrainerError(f"{models} is not a folder; a run writes its model there")
     check_inside(output, [_model_name(config.iterations), os.path.join(SCALARS_FOLDER, "events")])
     # A record may be a stranger's: nothing but products and models is removed by it.
     model = _model_name(0).replace("0", r"\d+").replace(".", r"\.")
@@ -311,7 +311,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         files = sorted({*PRODUCTS, *models, _model_name(config.iterations)})
         write_record(config.output, TRAIN, Record(os.path.abspath(config.scene), files), earlier)
         if not resume:
-            # First the old options: what is left if this is killed is no run, and --resume does not go on with it.
+            # config.json goes first: if this is killed, the folder holds no run that --resume could take up.
             remove_files(config.output, [CONFIG_NAME])
             remove_files(config.output, [*files, *(scalar_files(config.output) if overwrite else ())])
         config.save(config.output)

@@ -24,7 +24,7 @@ Scope = Optional[ast.AST]  # a function; None: the file
 
 
 def kind_of(node: Any, module: str, local: Set[str]) -> str:
-    """Returns of which kind the module of an import is, "" where it is no rasterizer.
+    """Returns of which kind the module of an import is, "" where it is not a rasterizer.
 
     local: the names of modules in the checkout.
     """

@@ -107,6 +107,8 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     warnings += [f"the results are told by what the trainer calls them: {one} ({name})"
                  for name, one in flavours.items() if "," in one and one not in ("color,radii", trainer)]
     warnings += [f"{name} computes something else: an import of it fails here" for name in blocked]
+    warnings += [f"the trainer may call gsplat's {name}, which this package has not: that ends the command"
+                 for name in sorted(facts.those(found, "calls gsplat's ")) if name.startswith("rasterization")]
     shown = {facts.OF_GSPLAT: flavour} if flavour == facts.OF_GSPLAT else flavours
     will_be = ", ".join(f"{', '.join(name for name in shown if shown[name] == one)} will be {one}"
                         for one in dict.fromkeys(shown.values()))
@@ -202,7 +204,7 @@ def _check_python(program: str, environment: Dict[str, str]) -> None:
     if not re.fullmatch(r"python[\d.]*", Path(program).name):
         return
     find = "import importlib.util as u, sys; sys.exit(not (u.find_spec('dsmoe') and u.find_spec('torch')) and 41)"
-    with contextlib.suppress(OSError):  # it is no program: what starts it will say so
+    with contextlib.suppress(OSError):  # it is not a program: what starts it will say so
         if subprocess.run([program, "-c", find], env=environment, check=False).returncode == 41:
             raise PatchError(f"{program} has not this package, or no PyTorch: install it there (pip install .), or "
                              f"name the Python that has it, such as {sys.executable}")
@@ -224,7 +226,7 @@ def _folders(script: Optional[Path]) -> List[Path]:
 def _read(folder: Path, everywhere: bool) -> Dict[str, bytes]:
     """Returns the Python files in a folder and two levels below it; {} if none imports a rasterizer.
 
-    everywhere: also if it is no checkout like that of 3DGS.
+    everywhere: also if it is not a checkout like that of 3DGS.
     """
     patterns = ("*.py", "*/*.py", "*/*/*.py") if everywhere or (folder / GR).is_file() else ()
     paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())

@@ -27,7 +27,7 @@ from diff_smoe_rasterization.settings import (
 )
 
 STAND_INS = Path(__file__).resolve().parent / "stand_ins"
-OPTIONS = ("blend_mode", "background_gate", "faint_below")  # as cfg_args records them; the last one is no flag
+OPTIONS = ("blend_mode", "background_gate", "faint_below")  # as cfg_args records them; the last one is not a flag
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
@@ -252,8 +252,20 @@ def gsplat_of_run() -> None:
         for module in ("gsplat", "gsplat.rendering", "gsplat.relocation", "gsplat.strategy.ops"):
             if hasattr(sys.modules.get(module), name):
                 setattr(sys.modules[module], name, function)
+    for module in filter(None, map(sys.modules.get, ("gsplat", "gsplat.rendering"))):
+        for name in [name for name in vars(module) if name.startswith("rasterization_")]:
+            setattr(module, name, _refusing(name))  # which a trainer may call by its options alone
     keep_records()
     _say_rasterizer("gsplat")
+
+
+def _refusing(name: str) -> Callable[..., Any]:
+    """Returns what stands for a rasterizer of gsplat's that this package has not."""
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise NotImplementedError(f"dsmoe run: the trainer calls gsplat's {name}, which this package has not; choose "
+                                  "gsplat's rasterization in the trainer's options, or run it without dsmoe run")
+
+    return refuse
 
 
 def _warn_of_no_kernels() -> None:

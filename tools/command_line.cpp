@@ -97,7 +97,7 @@ void CommandLine::check_output(const std::string& file, const std::string& folde
   const fs::file_status status = fs::symlink_status(file, ignored);
   if (!fs::exists(status)) return;
   if (!fs::is_regular_file(status)) {
-    throw UsageError(io::printable(file) + " is no regular file, which is never replaced; -o names another");
+    throw UsageError(io::printable(file) + " is not a regular file, which is never replaced; -o names another");
   }
   if (!has("overwrite")) {
     throw UsageError(io::printable(file) + " is there already; --overwrite replaces it, -o names another");

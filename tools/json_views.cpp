@@ -80,7 +80,7 @@ void check_rotation(const Node& node, const Rotation& r) {
   const auto dot = [](const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; };
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) {
-      if (!(std::abs(dot(row(i), row(j)) - (i == j ? 1 : 0)) <= kMaxSkew)) node.fail("is no rotation");
+      if (!(std::abs(dot(row(i), row(j)) - (i == j ? 1 : 0)) <= kMaxSkew)) node.fail("is not a rotation");
     }
   }
   const double determinant =

@@ -43,7 +43,7 @@ int run(int argc, char** argv) {
   std::vector<Picture> pictures;
   for (const std::string& name : split(line.text("blends", "smoe,smoe_tn,smoe_std"), ',')) {
     const auto found = std::find(names.begin(), names.end(), name);
-    if (found == names.end()) throw UsageError("--blends has \"" + name + "\", which is no blend");
+    if (found == names.end()) throw UsageError("--blends has \"" + name + "\", which is not a blend");
     const auto mode = static_cast<BlendMode>(found - names.begin());
     const OccluderRendering rendering = render_occluder(mode, size, threads);
     std::printf("%-8s leak %7.4f  change %.4f\n", name.c_str(), rendering.ghost.leak, rendering.ghost.change);

@@ -51,7 +51,7 @@ cv::Scalar scalar_of(const Color& color) { return {color[2] * 255, color[1] * 25
 
 Picture read_picture(const std::string& path) {
   const cv::Mat bytes = cv::imread(path, cv::IMREAD_COLOR);
-  if (bytes.empty()) throw std::runtime_error(path + ": is no picture that OpenCV can read");
+  if (bytes.empty()) throw std::runtime_error(path + ": is not a picture that OpenCV can read");
   return from_bytes(bytes);
 }
 

@@ -86,4 +86,4 @@ def arrays_of(path: str) -> Dict[str, np.ndarray]:
     except OSError:
         raise
     except Exception as error:  # damaged files: numpy, zipfile and zlib raise many kinds
-        raise ValueError(f"{path} is no .npz file that can be read ({type(error).__name__})") from error
+        raise ValueError(f"{path} is not a .npz file that can be read ({type(error).__name__})") from error

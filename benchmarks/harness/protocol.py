@@ -10,7 +10,7 @@ from typing import Any, Dict, Optional
 from ..config import TrainConfig
 from .names import RECIPE
 
-COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit if its files are no git checkout
+COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit if its files are not a git checkout
 ROOT = str(Path(__file__).resolve().parents[2])  # of the package
 BYTES_PER_GAUSSIAN = 4 * 59  # float32 numbers: position 3, SH colours 48, opacity 1, scale 3, quaternion 4
 

@@ -64,7 +64,7 @@ class Part(BaseModel):
     def knows_all_fields(cls, given: Any) -> Any:
         unknown = sorted(set(map(str, given)) - set(cls.model_fields)) if isinstance(given, dict) else []
         if unknown:
-            raise ValueError(f"{unknown[0]!r} is no field here; allowed are {', '.join(sorted(cls.model_fields))}")
+            raise ValueError(f"{unknown[0]!r} is not a field here; allowed are {', '.join(sorted(cls.model_fields))}")
         return given
 
 
@@ -132,7 +132,7 @@ def first_mistake(error: ValidationError) -> Tuple[str, str]:
     found = min(error.errors(), key=lambda one: list(map(str, one["loc"])))
     where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in found["loc"]).lstrip(".")
     kind, given, said = found["type"], found["input"], found["msg"]
-    if kind == "missing" or " is no field here" in said:
+    if kind == "missing" or " is not a field here" in said:
         return where, "is missing" if kind == "missing" else said.partition(", ")[2]
     words = said.partition(", ")[2] if kind == "value_error" else said.replace("Input should", "it must")
     what = f"is {given!r}; {words.partition(' or instance')[0]}"

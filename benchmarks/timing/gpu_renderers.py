@@ -88,7 +88,7 @@ def ours(name: str) -> Type[Ours]:
     word, _, rest = name.partition(" ")
     blend, _, how = rest.partition(" ")
     if word != "ours" or how not in MORE_SETTINGS:
-        raise ValueError(f"{name} is no renderer")
+        raise ValueError(f"{name} is not a renderer")
     mode_and_gate(blend)
     return type(name, (Ours,), {"blend": blend, "more_settings": MORE_SETTINGS[how], "is_alpha": blend == "alpha"})
 

@@ -48,7 +48,7 @@ class BatchTrainer(Trainer):
         return self.batches.asked
 
     def _evaluate(self, views: Sequence[View], progress: bool, measure: Measure, passes: int) -> Evaluation:
-        """Each view in one of the processes; a time of a view is that of all by their number."""
+        """Each view in one process; a view's time is the total divided by the number of views."""
         group, device, shown = self.group, self.config.device, self.result()
 
         def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:

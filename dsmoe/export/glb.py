@@ -68,7 +68,7 @@ def glb_gaussians(content: bytes) -> Gaussians:
     try:
         magic, _, _, length, kind = struct.unpack_from("<4s2II4s", content)
         if (magic, kind) != (b"glTF", b"JSON"):
-            raise ValueError("it is no binary glTF")
+            raise ValueError("it is not a binary glTF")
         document, binary = json.loads(content[20:20 + length]), content[28 + length:]
         primitives = [primitive for mesh in document["meshes"] for primitive in mesh["primitives"]
                       if SPLATTING in primitive.get("extensions", {})]

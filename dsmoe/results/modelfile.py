@@ -73,7 +73,7 @@ def read_ply(path: str) -> io.Gaussians:
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
-        other = "; it is no model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
+        other = "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
         raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
 
 

@@ -88,7 +88,7 @@ def with_masks(folder: str, layout: Layout) -> Layout:
         return layout
     if not is_folder(masks):
         if os.path.lexists(masks):
-            raise SceneError(f"{masks} is no folder; masks must lie in one, one image each")
+            raise SceneError(f"{masks} is not a folder; masks must lie in one, one image each")
         return layout
 
     def with_mask(image: PosedImage) -> PosedImage:

@@ -73,7 +73,7 @@ def _camera(entry: Any) -> Camera:
     if turn.shape != (3, 3) or place.shape != (3,) or not np.isfinite([*turn.flat, *place, *numbers]).all():
         raise ValueError(f"`rotation` and `position` of {entry['img_name']} must be finite, [3, 3] and [3]")
     if not (np.abs(turn @ turn.T - np.eye(3)).max() < MAX_SKEW and np.linalg.det(turn) > 0):
-        raise ValueError(f"`rotation` of {entry['img_name']} is no rotation")
+        raise ValueError(f"`rotation` of {entry['img_name']} is not a rotation")
     if not (min(numbers[:2]) > 0 and min(width, height) > 0):
         raise ValueError(f"`width`, `height`, `fx` and `fy` of {entry['img_name']} must be above 0")
     return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width, height)

@@ -86,7 +86,7 @@ def _listed_split(folder: str, path: str, content: Dict[str, Any], images: List[
         lists[kind] = [_name_of(folder, _image_path(folder, name)) for name in names]
         unknown = sorted({*lists[kind]} - {image.camera.name for image in images})
         if unknown:
-            raise SceneError(f"{path}: `{kind}_filenames` names {unknown[0]}, which is no frame")
+            raise SceneError(f"{path}: `{kind}_filenames` names {unknown[0]}, which is not a frame")
     if not lists:
         return None
     test_kind = "test" if "test" in lists or "val" not in lists else "val"

@@ -138,7 +138,7 @@ def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
     """Plain values that differ between scenes and stay when a folder is moved: what a resumed run must find again."""
 
     def lines(texts: Iterable[str]) -> str:
-        return _checksum("\n".join(sorted(texts)).encode("utf-8", "surrogateescape"))  # a name may be no UTF-8
+        return _checksum("\n".join(sorted(texts)).encode("utf-8", "surrogateescape"))  # a name may not be UTF-8
 
     def names_and_sizes(views: Sequence[View]) -> str:
         return lines(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)

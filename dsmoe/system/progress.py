@@ -11,9 +11,9 @@ SECONDS = 60.0  # between two lines
 
 
 class _Lines:
-    """Stands for a stream that is no terminal: of all that a bar draws it writes a line a minute, the first after one.
+    """Stands for a stream that is not a terminal: a line a minute of what a bar draws, the first after a minute.
 
-    So what takes less than that leaves nothing.
+    What takes less than a minute leaves nothing.
     """
 
     def __init__(self, stream: TextIO) -> None:

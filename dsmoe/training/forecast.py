@@ -45,8 +45,8 @@ class Forecast:
 
     def text(self, left: int, seconds: float) -> str:
         """left: iterations."""
-        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, "
-                + ("less as Gaussians are removed" if self.removes else "longer as Gaussians are added"))
+        line = f"at this speed the other {left:,} iterations take about {duration(seconds)}, "
+        line += "less and less as Gaussians are removed" if self.removes else "longer as Gaussians are added"
         if seconds < LONG_SECONDS or not self.shorter:
             return line
         return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: --overwrite {self.shorter}"

@@ -25,7 +25,6 @@ GROWTH_ENDS = 8 / 15
 REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
 REMOVALS_BEGIN_FROM_MODEL = 0.02  # a model that has enough Gaussians does not grow
 MOVES_END = 4 / 3
-MOVE_INTERVAL = 1 / 30
 
 # The average begins behind 21,000. Between two of its terms are so many steps, fewer in the shortest runs, and at least
 # a batch.
@@ -84,7 +83,7 @@ class ImportanceStrategy(SteadyStrategy):
         last = config.iterations - config.batch  # the last step changes nothing
         self.removals = [min(last, round(until * (begin + (REMOVALS_END - begin) * i / count))) for i in range(count)]
         self.drops_unneeded = is_enough and DROPS_UNNEEDED
-        interval = max(1, round(MOVE_INTERVAL * until))
+        interval = max(1, round(until / self.options.pace))
         self.moves_end = round(MOVES_END * until)
         self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
                       if iteration > self.removals[-1] and self.options.moves > 0]
@@ -124,8 +123,12 @@ class ImportanceStrategy(SteadyStrategy):
                           for part in parts])
 
     def is_of_few(self) -> torch.Tensor:
-        """[N] which Gaussians few views need; of fewer views that a decision looks at, as small a part."""
-        return self.needed * len(self.context.views) < self.options.needs * self.looks
+        """[N] which Gaussians few views need, at most half of all; of views that a decision looks at, as small a part.
+
+        Of one or two views no Gaussian could have three.
+        """
+        views = len(self.context.views)
+        return self.needed * views < min(self.options.needs, views / 2) * self.looks
 
     def squares(self, iteration: int) -> float:
         return self.options.squares if iteration > self.moves_end else 0.0
@@ -154,11 +157,6 @@ class ImportanceStrategy(SteadyStrategy):
             part = min(1.0, between / min(self.average_span, terms * between))
             gate = self.context.render.background_gate
             self.context.optimizer.add_to_average(part, gate if isinstance(gate, torch.Tensor) else None)
-
-    @property
-    def looks(self) -> int:
-        """How many training views a decision looks at."""
-        return min(self.options.views, len(self.context.views))
 
     @property
     def densify_until(self) -> int:
@@ -213,7 +211,8 @@ class ImportanceStrategy(SteadyStrategy):
         own = shards.own_rows(mask)
         self.context.optimizer.keep(own)
         shards.settle(torch.zeros_like(own, dtype=torch.long)[own])
-        self._forget_statistics()
+        super()._forget_statistics()
+        self._forget_looks(moves_next=kept == self.context.config.budget)
 
     def move(self) -> None:
         """Moves the cheapest Gaussians to others, drawn by their error, which are split there.
@@ -224,7 +223,7 @@ class ImportanceStrategy(SteadyStrategy):
         self._look_at_the_rest()
         near = self.is_near()
         costs, errors = self.costs.masked_fill(near | self.is_of_few(), 0), self.errors.masked_fill(near, 0)
-        self._forget_looks()
+        self._forget_looks(moves_next=True)
         moves = self.context.shards.decide(self._choose_moves, costs, errors)
         self.split(*moves.unbind(1))
 
@@ -267,6 +266,8 @@ class ImportanceStrategy(SteadyStrategy):
     def looks_at(self, iteration: int, views: Sequence[View]) -> List[int]:
         """Those that the next decision wants: the first of each group, in the last round of the views."""
         removes = self.context.num_gaussians > self.context.config.budget
+        if iteration <= self.context.config.half_until_iter:  # of smaller images costs and errors would be smaller
+            return []
         begun = iteration - self.context.config.batch
         following = next((later for later in [*self.removals, *self.moves] if later > begun), None)
         wanted: List[int] = []
@@ -299,23 +300,24 @@ class ImportanceStrategy(SteadyStrategy):
         super()._forget_statistics()
         self._forget_looks()
 
-    def _forget_looks(self) -> None:
+    def _forget_looks(self, moves_next: bool = False) -> None:
         """Begins new sums, [N], for the next decision, which looks at a view of each group of neighbours."""
         self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
         self.errors = torch.zeros_like(self.view_count)  # the squared error of its pixels, by its share
         self.needed = torch.zeros_like(self.view_count)  # how many of the views need the Gaussian
         views = self.context.views
-        count = self.looks
+        wanted = self.options.move_views if moves_next else 0
+        count = self.looks = min(wanted or self.options.views, len(views))
         first = int(torch.randint(len(views), ()))
         # The group of each view, by name. A look at a view takes out its group.
         self.sought = {views[(first + i) % len(views)].camera.name: i * count // len(views) for i in range(len(views))}
 
     def state_dict(self) -> Dict[str, Any]:
         return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
-                "needed": self.needed, "sought": self.sought}
+                "needed": self.needed, "sought": self.sought, "looks": self.looks}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.start = state["start"]
         self.costs, self.errors, self.needed = state["costs"], state["errors"], state["needed"]
-        self.sought = dict(state["sought"])
+        self.sought, self.looks = dict(state["sought"]), state["looks"]

@@ -64,6 +64,9 @@ class Passes:
         """Steps the parameters that have not been replaced since `render`."""
         raise NotImplementedError
 
+    def warm_up(self) -> None:
+        """Images have another size from here on."""
+
     def look(self, views: Sequence[View]) -> Iterator[Look]:
         """Renders views beside the steps, and looks at each."""
         for view in views:
@@ -150,12 +153,15 @@ class DirectPasses(Passes):
         # How many steps harmonics may have missed, then the rates of geometry and of harmonics, as the ops take them.
         self._numbers = model.stored["means3D"].new_zeros(1 + 2 * len(PARAMETERS))
 
+    def warm_up(self) -> None:
+        self._graphs.warm_up()
+
     @torch.no_grad()
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()
                ) -> ViewStep:
         (shown,) = views
         stored, lazy = self.model.stored, self.optimizer.lazy_colors()
-        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
+        # Weak: parameters that a densification replaces are freed at once, not at the next rendering.
         self._rendered = {name: weakref.ref(tensor) for name, tensor in stored.items()}
         self._activate()
         steps = lazy.begin_catch_up()

@@ -49,7 +49,7 @@ class Shards:
         return function(count)
 
     def settle(self, kinds: torch.Tensor) -> None:
-        """Puts the Gaussians in order once some were added or removed: by kind, within a kind as they lie.
+        """Sorts the Gaussians by kind, stably, after some were added or removed, and divides them evenly.
 
-        kinds: [N] int64, rising; and divides them evenly.
+        kinds: [N] int64, rising.
         """

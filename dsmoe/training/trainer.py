@@ -61,6 +61,7 @@ class Trainer:
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
             lambda views: self.passes.look(views), self.shards))
         self.order = ViewOrder(len(scene.train), config.seed)
+        self.half_views = [view.halved() for view in self.scene.train] if config.half_until_iter else []
         self.watch = Stopwatch(config.device)
         self.iteration = 0
         self.wants_stop: Callable[[], bool] = lambda: False  # whether this process was asked to stop
@@ -162,8 +163,14 @@ class Trainer:
         return step
 
     def _next_views(self) -> List[ViewOver]:
-        config = self.config
-        views = [self.scene.train[self.order.next()] for _ in range(config.batch)]
+        config, every = self.config, self.scene.train
+        if self.half_views:
+            if self.iteration <= config.half_until_iter:
+                every = self.half_views
+            else:
+                self.half_views = []
+                self.passes.warm_up()
+        views = [every[self.order.next()] for _ in range(config.batch)]
         return [ViewOver(view, torch.rand(3, device=config.device) if config.random_background else None)
                 for view in views]
 

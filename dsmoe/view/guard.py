@@ -29,15 +29,15 @@ def refusal(origin: Optional[str], host: Optional[str], served_at: str) -> Optio
     name = _host_name(host or "")
     if not (_is_address(name) or name == "localhost" or name.endswith(".localhost")
             or name in {each.lower() for each in (served_at, socket.gethostname(), socket.getfqdn())}):
-        return (f"{host!r} is no name of this machine that the viewer knows: open it by the machine's IP address, or "
-                "start it with this name as --host")
+        return (f"{host!r} is not a name of this machine that the viewer knows: open it by the machine's IP address, "
+                "or start it with this name as --host")
     if origin is not None and origin.lower().partition("://")[2] != (host or "").lower():
         return f"a page of {origin!r} asks, which the viewer at {host!r} has not served"
     return None
 
 
 def _host_name(host: str) -> str:
-    """Without the port; "" of a text that is no host, such as `[::1]evil.example`."""
+    """Without the port; "" of a text that is not a host, such as `[::1]evil.example`."""
     found = re.fullmatch(r"(?:\[([\da-f:.%]+)\]|([^\[\]:]*))(?::\d*)?", host.lower(), re.ASCII)
     return (found[1] or found[2] or "") if found else ""
 
@@ -109,7 +109,7 @@ def only_own_pages(served_at: str, takes: Takes) -> Iterator[None]:
             async def next_wanted(*arguments: Any, **options: Any) -> Any:
                 while True:
                     data = await receive(*arguments, **options)
-                    with contextlib.suppress(Exception):  # what is no MessagePack is dropped too
+                    with contextlib.suppress(Exception):  # what is not MessagePack is dropped too
                         if is_wanted(msgspec.msgpack.decode(data), takes):
                             return data
 

@@ -71,7 +71,7 @@ class Controls:
     def take(self, uuid: str, value: Any) -> bool:
         """Whether the control that viser knows by `uuid` takes a browser's value: a text or a number, as it has one.
 
-        viser makes the one of the other, and fails if a text is no number.
+        viser makes the one of the other, and fails if a text is not a number.
         """
         return any(control._impl.uuid == uuid and isinstance(value, str) == isinstance(control.value, str)
                    for control in self._all)

@@ -144,7 +144,7 @@ TYPED_TEST(GateOfMode, LogGateIsTheGate) {
   expect_log_gate_is_the_gate<TypeParam::value>(1e-12, 4e-14);
 }
 
-// If the form is no ellipse the exponent may be positive: such a pair does not count, and has no infinite gate that
+// If the form is not an ellipse the exponent may be positive: such a pair does not count, and has no infinite gate that
 // matters. Nor does a pair of a Gaussian that reaches no pixel.
 TYPED_TEST(GateOfMode, LogGateLeavesOutPositiveExponents) {
   const LogGate<double> no_ellipse({0.5, 2.0, 0.5}, 0.9, 11.0);

@@ -232,9 +232,9 @@ TEST(ColmapErrors, OfBinaryFilesNameByteAndReason) {
 
   EXPECT_NO_THROW(images(image_bytes(1, 0, "a.jpg")));
   expect_error(images, huge, "1152921504606846976");
-  expect_error(images, image_bytes(0, 0, "a.jpg"), "image 5 \"a.jpg\" has a qvec that is no rotation");
-  expect_error(images, image_bytes(kNan, 0, "a.jpg"), "no rotation");
-  expect_error(images, image_bytes(1e200, 0, "a.jpg"), "no rotation");
+  expect_error(images, image_bytes(0, 0, "a.jpg"), "image 5 \"a.jpg\" has a qvec that is not a rotation");
+  expect_error(images, image_bytes(kNan, 0, "a.jpg"), "not a rotation");
+  expect_error(images, image_bytes(1e200, 0, "a.jpg"), "not a rotation");
   expect_error(images, image_bytes(1, kNan, "a.jpg"), "nan in its tvec");
   expect_error(images, image_bytes(1, 0, ""), "number of images");  // too small a file for one image
   expect_error(images, image_bytes(1, 0, "") + "x", "no usable name");
@@ -258,12 +258,12 @@ TEST(ColmapErrors, OfTextFilesNameLineAndReason) {
   expect_error(cameras, "1 PINHOLE 8 8 1 1 4 4 4", "does not belong there");
   expect_error(cameras, "1 PIN_HOLE 8 8 1 1 4 4", "unknown camera model \"PIN_HOLE\"");
   expect_error(cameras, "1 PINHOLE 8.5 8 1 1 4 4", "width is \"8.5\"");
-  expect_error(cameras, "1 PINHOLE 8 8 1 one 4 4", "\"one\", which is no number");
+  expect_error(cameras, "1 PINHOLE 8 8 1 one 4 4", "\"one\", which is not a number");
   expect_error(cameras, "-1 PINHOLE 8 8 1 1 4 4", "id is \"-1\"");
   expect_error(cameras, "4294967296 PINHOLE 8 8 1 1 4 4", "id is \"4294967296\"");
   expect_error(images, "1 1 0 0 0 0 0 0", "camera id is missing");
   expect_error(images, "1 1 0 0 0 0 0 0 1", "no usable name");
-  expect_error(images, "1 0 0 0 0 0 0 0 1 a.jpg", "no rotation");
+  expect_error(images, "1 0 0 0 0 0 0 0 1 a.jpg", "not a rotation");
   expect_error(images, "1 1 0 0 0 0 0 0 1 a" + std::string(1, '\0') + ".jpg", "no usable name");
   expect_error(points, "1 0 0 inf 1 2 3 0", "coordinate inf");
   expect_error(points, "1 0 0 0 256 2 3 0", "colour is \"256\"");

@@ -402,7 +402,7 @@ TYPED_TEST(RasterizeIn, CulledGaussiansGetZeroGradientsAndTheOthersAsIfAlone) {
   EXPECT_EQ(render(without).color, r.color);
 }
 
-// cov3D_precomp is the caller's and may be no covariance at all. A determinant above 0 does not exclude negative
+// cov3D_precomp is the caller's and may not be a covariance at all. A determinant above 0 does not exclude negative
 // definite ones, whose exponents grow without bound away from the centre.
 TYPED_TEST(RasterizeIn, GivenCovariancesOfAnyKindLeaveGradientsFinite) {
   Scene<float> scene = in_mode(convert<float>(make_scene(30, 1000, 37, 29)), TypeParam::value);

@@ -131,7 +131,7 @@ TYPED_TEST(RemovalIn, ShowsTheBackgroundWithoutTheOnlyOwner) {
 }
 
 TYPED_TEST(RemovalIn, ShowsTheVeilInFrontOfAWall) {
-  for (const double veil : {0.1, 1e-3, 1e-5, 1e-24}) {  // the square of the last one is no float
+  for (const double veil : {0.1, 1e-3, 1e-5, 1e-24}) {  // the square of the last one is not a float
     Pixel pixel;
     pixel.alpha = {veil, 0.9}, pixel.color = {0.2, 0.8};
     // smoe_tn keeps no sum of the weights in front. It takes 1 - T, which has lost digits, or less by at most veil / 2.

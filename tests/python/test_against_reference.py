@@ -52,7 +52,7 @@ def _with_scale_modifier(mode):
 
 
 def _with_any_camera(mode):
-    """Different focal lengths, a view matrix that is no rotation, a projection and a centre that match neither."""
+    """Different focal lengths, a view matrix that is not a rotation, a projection and a centre that match neither."""
     scene = random_scene(mode, seed=24)
     settings = scene.settings
 

@@ -177,7 +177,7 @@ def test_build_info_tells_what_runs():
 
 
 def test_the_settings_and_the_op_have_the_same_fields():
-    """A setting is a line of csrc/torch/fields.h and a field of this name; these options are no settings."""
+    """A setting is a line of csrc/torch/fields.h and a field of this name; these options are not settings."""
     options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward"}
     fields = set(GaussianRasterizationSettings._fields)
     assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
@@ -231,7 +231,7 @@ def test_images_may_be_edited_in_place(mode, outputs):
 
 @on_every_device
 def test_radii_changed_in_place_before_backward_are_noticed(mode):
-    """They are no image, and say which Gaussians have a gradient."""
+    """They are not an image, and say which Gaussians have a gradient."""
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32).requiring_grad()
     rendering = rasterize(settings=scene.settings, **scene.inputs)
     rendering.radii.fill_(1)

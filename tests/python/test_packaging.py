@@ -74,7 +74,8 @@ def test_links_of_the_tree_are_made_again(tmp_path, as_text):
         (path.parent / target).mkdir(parents=True, exist_ok=True)
     for _ in range(2):
         setup.restore_links(tmp_path)
-        assert all((tmp_path / link).samefile((tmp_path / link).parent / target) for link, target in setup.LINKS.items())
+        for link, target in setup.LINKS.items():
+            assert (tmp_path / link).samefile((tmp_path / link).parent / target)
 
 
 def test_an_sdist_holds_each_file_of_the_linked_folders_once(tmp_path):

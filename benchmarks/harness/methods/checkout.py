@@ -167,7 +167,7 @@ class TwoDGS(ThreeDGS):
 class C3DGS(ThreeDGS):
     """Compressed 3DGS: a 3DGS checkout (`base`) trains, compress.py compresses and finetunes, render.py renders."""
 
-    stubs = ()  # compress.py measures LPIPS
+    stubs = ("lpips",)  # compress.py measures it, with weights that it would download
     container = "point_cloud.npz"
     trains_with_arguments = False  # they are those of compress.py
 

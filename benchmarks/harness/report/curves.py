@@ -115,7 +115,7 @@ def _amounts(axis, values: Sequence[float]) -> None:
 
 
 def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
-    """How each series is drawn: lines through three points and more, since two are no curve.
+    """How each series is drawn: lines through three points and more, since two are not a curve.
 
     Marks in one place are all seen: those of each next method and strategy are smaller and in front, and those of
     alpha, in front of the other blends', are hollow.

@@ -1,7 +1,7 @@
 // How much memory the tile instances of a rendering get, before the GPU has counted them. The guess is the number of
 // instances per Gaussian of earlier renderings with the same image size, mode and about as many Gaussians. A bad guess
-// costs time, never correctness (rasterize_cuda.h). The background's gate is no part of the key, because the host does
-// not know the value of a tensor. A count is forgotten after 1,024 to 2,048 renderings, so that one large view does not
+// costs time, never correctness (rasterize_cuda.h). The background's gate is not in the key, because the host does not
+// know the value of a tensor. A count is forgotten after 1,024 to 2,048 renderings, so that one large view does not
 // enlarge the key sort and the memory for ever. This table of sizes is all that outlives a call.
 #pragma once
 

@@ -75,11 +75,11 @@ template <class S, int kChannels> struct WeighedPixels {
   S weight[kLanePixels], share_weight[kLanePixels];  // in the caller's maps
   S alone[kLanePixels];                              // |bg - C|^2
   int32_t last[kLanePixels];                         // entries of the list that the numerator has seen
-  bool wide[kLanePixels];                            // the pixel is
+  bool wide[kLanePixels];                            // whether the pixel is wide
 };
 
-// The numbers of one Gaussian in shared memory, by lane. Four lanes sum a row. Between its rows lie some numbers, so
-// that lanes of eight rows read from different banks.
+// The numbers of one Gaussian in shared memory, by lane. Four lanes sum a row. Rows are padded, so that lanes of eight
+// rows read from different banks.
 template <class S> struct ImportanceRow {
   alignas(16) S numbers[Importance<S>::kNum][kWarp];
   S apart[16 / sizeof(S)];
@@ -168,9 +168,8 @@ template <class S, BlendMode kMode, int kChannels, class Sums, Pairs kWanted> st
 template <class S, BlendMode kMode, int kChannels>
 constexpr bool kWeighsSegments = kWalksSegments<S, kMode, kChannels>&& Blend<kMode>::kStopsEarly;
 
-// Whether T tells enough of what lies in front of a segment. W = 1 - T loses digits if it is small, and so does D,
-// unless a gate of the background is in it: behind 1,300 opacities of 2e-5 to 5e-5 the norm of the costs is off by
-// 4.4e-4 at the gate 0, by 1.2e-4 at 0.03.
+// Whether a segment can start from the saved T alone. For small W, 1 - T loses digits; a background gate keeps D large
+// enough. Behind 1,300 opacities of 2e-5 to 5e-5 the norm of the costs is off by 4.4e-4 at gate 0, by 1.2e-4 at 0.03.
 template <BlendMode kMode, class Config> __device__ bool knows_front(const Config& config) {
   return !Blend<kMode>::kDivides || config.blend.lambda() >= 0.01f;
 }

@@ -66,7 +66,7 @@ template <typename Cursor> void check_image(const Cursor& cursor, ColmapImage& i
   if (image.name.empty() || image.name.find('\0') != std::string::npos) cursor.fail(what, "has no usable name");
   double squared_length = 0;
   for (const double q : image.qvec) squared_length += q * q;
-  if (!std::isfinite(squared_length) || !(squared_length > 0)) cursor.fail(what, "has a qvec that is no rotation");
+  if (!std::isfinite(squared_length) || !(squared_length > 0)) cursor.fail(what, "has a qvec that is not a rotation");
   for (double& q : image.qvec) q /= std::sqrt(squared_length);
   for (const double t : image.tvec) {
     if (!std::isfinite(t)) cursor.fail(what, "has " + shortest_text(t) + " in its tvec");

@@ -115,7 +115,7 @@ std::string_view LineCursor::field(const char* what) {
 double LineCursor::number(const char* what) {
   const std::string_view text = field(what);
   double value = 0;
-  if (!parse_number(text, value)) fail(what, "is " + printable(text) + ", which is no number");
+  if (!parse_number(text, value)) fail(what, "is " + printable(text) + ", which is not a number");
   return value;
 }
 

@@ -107,7 +107,7 @@ std::string read_name(LineCursor& lines, const char* what) {
   const std::string_view name = lines.field(what);
   const auto is_control = [](char c) { return (c >= 0 && c < ' ') || c == '\x7f'; };
   if (std::any_of(name.begin(), name.end(), is_control))
-    lines.fail(what, "is " + printable(name) + ", which is no name");
+    lines.fail(what, "is " + printable(name) + ", which is not a name");
   return std::string(name);
 }
 

@@ -22,7 +22,7 @@ GaussianModel read_splat(const std::string& path) { return parse_splat(read_file
 GaussianModel parse_splat(std::string_view bytes, const std::string& file) {
   if (bytes.size() % kRecordBytes != 0) {
     throw FormatError(file + ": has " + std::to_string(bytes.size()) +
-                      " bytes, which is no multiple of 32 (truncated file, or no .splat?)");
+                      " bytes, which is not a multiple of 32 (truncated file, or no .splat?)");
   }
   ByteCursor cursor(bytes, file);
   GaussianModel model;

@@ -11,7 +11,7 @@ namespace dsmoe::io {
 
 /// Reads a model of degree 0. The file holds rounded colours and opacities behind their activations; the outermost
 /// levels of opacity stand for half a level inside them, so that logits are finite. It records no blend mode.
-/// Throws FileError; FormatError if the size is no multiple of 32, and for a position or scale that is NaN or
+/// Throws FileError; FormatError if the size is not a multiple of 32, and for a position or scale that is NaN or
 /// infinite, and a scale below 0.
 GaussianModel read_splat(const std::string& path);
 

@@ -1,4 +1,4 @@
-// The Python module _core: what is no tensor op. It needs Python and numpy, but no torch.
+// The Python module _core: what is not a tensor op. It needs Python and numpy, but no torch.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 

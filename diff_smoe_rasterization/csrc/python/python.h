@@ -10,7 +10,7 @@ namespace dsmoe {
 
 namespace python {
 
-// Text as Python's str; bytes that are no UTF-8 appear as \xNN.
+// Text as Python's str; bytes that are not UTF-8 appear as \xNN.
 pybind11::str text(const std::string& utf8);
 
 // Sets the Python error of a C++ exception: an OSError, ValueError, MemoryError or RuntimeError.

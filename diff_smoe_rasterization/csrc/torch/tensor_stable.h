@@ -121,7 +121,7 @@ inline Tensor argsort(const Tensor& keys) { return call("aten::argsort", "", key
 inline Tensor index_select(const Tensor& tensor, int64_t dim, const Tensor& indices) {
   return call("aten::index_select", "", tensor, dim, indices);
 }
-inline Tensor abs_at_most(const Tensor& tensor, float limit) {  // a number is no argument that the stable ABI has
+inline Tensor abs_at_most(const Tensor& tensor, float limit) {  // a number is not an argument that the stable ABI has
   return call("aten::le", "Tensor", call("aten::abs", "", tensor), Tensor(torch::stable::full({}, limit, kFloat)));
 }
 inline Tensor to_cpu(const Tensor& tensor) {

@@ -1,5 +1,5 @@
 // One (Gaussian, pixel) pair: the projected kernel G (Eq. 1, 2), the gate alpha = min(0.99, o G), whether the pair
-// counts, and the derivatives by all that the pair was made of.
+// counts, and the derivatives by its inputs.
 #pragma once
 
 #include "dsmoe/constants.h"
@@ -47,7 +47,7 @@ template <class S> struct AlphaCut {
   DSMOE_HD S of(S opacity) const { return max(alpha_min, min(faint, opacity * S(kCoreKernel))); }
 };
 
-// The squared reach k^2 of a Gaussian that no pixel sees: no further reach that is added to it makes it 0.
+// The squared reach k^2 of a Gaussian that no pixel sees: still negative when a tail's reach is added.
 constexpr float kNoReach = -1e30f;
 
 // The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. If it is negative
@@ -97,7 +97,7 @@ template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> i
 template <class Real> DSMOE_HD Real clamped(Real logit) { return min(logit, Real(Scalar<Real>(kAlphaMax))); }
 
 template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
-  // If the exponent is above 0 the conic is no ellipse. Such a pair does not count, and must not overflow either.
+  // If the exponent is above 0 the conic is not an ellipse. Such a pair does not count, and must not overflow either.
   const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
@@ -127,12 +127,12 @@ template <class S> struct LogGate {
 
   template <class Real> DSMOE_HD ColumnExponent<Real, S> column(Real dx) const { return {factors, dx, greatest}; }
 
-  // As near_alpha. It is the same number again if `least` is that of a near pair.
+  // As near_alpha. Unchanged if `least` is a near pair's already.
   DSMOE_HD S near_least() const {
     return max(least, min(S(kLog2AlphaCut), max(S(kLog2CoreAlpha), greatest + S(kLog2CoreKernel))));
   }
 
-  // If log_logit is above log2(o) the conic is no ellipse. Such a pair does not count. least: of a pair that counts.
+  // Above log2(o) the conic is not an ellipse. Such a pair does not count. least: the least logit that counts.
   template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit, Real least) const {
     Gate<Real> gate;
     gate.logit = exp2(log_logit);

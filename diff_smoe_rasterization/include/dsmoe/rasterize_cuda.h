@@ -106,7 +106,7 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("segment_queue", saved.segment_queue, !sizes.segments ? 0 : known ? 2 * num_queue_entries(sizes.capacity) : -1);
 }
 
-// Sets the fields that are no arrays of their own. Call it when the arrays have their memory.
+// Sets the fields that are not arrays of their own. Call it when the arrays have their memory.
 template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes) {
   saved.num_ordered = saved.tile_offsets + sizes.tiles + 1;
   saved.num_instances = saved.num_ordered + 1;

@@ -48,7 +48,7 @@ struct GaussianRasterizationSettings {
   bool debug = false;                // check images and gradients for NaN; slower
   bool antialiasing = false;         // scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
   double near = 0.2;                 // Gaussians with view depth <= near are culled
-  double alpha_min = 0;              // SMoE modes: also skip alpha below this; `smoe`: such pairs are no strong ones
+  double alpha_min = 0;              // SMoE modes: also skip alpha below this; `smoe`: such pairs are not strong ones
   bool strict = false;               // raise if an attribute is NaN or infinite, instead of culling that Gaussian
   std::string blend_mode = "alpha";  // "alpha", "smoe", "smoe_eq7", "smoe_tn" or "smoe_std"
   bool deterministic = false;        // CUDA: gradients equal bit for bit from run to run; slower

@@ -62,7 +62,7 @@ TEST_F(CheckOutput, NeverReplacesWhatIsNoRegularFile) {
   ASSERT_EQ(mkfifo(pipe.c_str(), 0600), 0);
   fs::create_symlink(made("thesis.png"), link);
   for (const std::string& file : {pipe, link, folder_.string()}) {
-    EXPECT_NE(refusal(file, true).find("is no regular file"), std::string::npos) << file;
+    EXPECT_NE(refusal(file, true).find("is not a regular file"), std::string::npos) << file;
   }
 }
 

@@ -86,9 +86,9 @@ def test_weights_that_are_named_and_not_there_are_refused_where_they_are_wanted(
 
 
 @pytest.mark.parametrize("content, said", [
-    (b"", "is no .npz file that can be read (EOFError)"),
-    (b"some words", "is no .npz file that can be read"),
-    (b"PK\x03\x04 and no more", "is no .npz file that can be read"),
+    (b"", "is not a .npz file that can be read (EOFError)"),
+    (b"some words", "is not a .npz file that can be read"),
+    (b"PK\x03\x04 and no more", "is not a .npz file that can be read"),
     ({"conv1.weight": np.zeros((8, 3, 11, 11))}, "conv1.bias is missing; it must have shape [8]"),
     ({"conv1.weight": np.zeros((8, 3, 3, 3)), "conv1.bias": np.zeros(8)},
      "conv1.weight has shape [8, 3, 3, 3]; it must have shape [8, 3, 11, 11]")])

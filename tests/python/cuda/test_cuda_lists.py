@@ -71,7 +71,7 @@ def test_room_for_one_large_view_is_given_up_again(gpu):
     large = small.with_inputs(scales=small.inputs["scales"] * 60)
     room_for(small)
     count = room_for(large)[1]
-    assert room_for(small)[0] >= count > 10 * room_for(small)[1], "the large view is no outlier"
+    assert room_for(small)[0] >= count > 10 * room_for(small)[1], "the large view is not an outlier"
     for _ in range(FORGOTTEN):
         op_results(small)
     room, count_of_small = room_for(small)

@@ -184,7 +184,7 @@ def test_a_file_that_is_there_is_replaced_only_where_asked(model, tmp_path, caps
     path.unlink()
     os.mkfifo(path)
     assert main(["export", model, "-o", str(path), "--overwrite"]) == 1
-    assert "is no regular file" in capsys.readouterr().err and not path.is_file()
+    assert "is not a regular file" in capsys.readouterr().err and not path.is_file()
 
 
 def test_a_page_refuses_the_ablations(tmp_path, capsys):

@@ -203,7 +203,7 @@ def test_what_does_not_fit_is_refused(device):
     for function in (lazy.step, lazy.catch_up):
         with pytest.raises(TypeError, match=f"LazyAdam.{function.__name__}: radii is of type list; it must be a torch"):
             function([1, 1, 1, 1])
-    assert lazy.adam.state[first]["step"] == 0, "what was refused is no step"
+    assert lazy.adam.state[first]["step"] == 0, "what was refused is not a step"
     with pytest.raises(TypeError, match="LazyAdam: adam is of type SGD; it must be a FusedAdam"):
         LazyAdam(torch.optim.SGD([first], lr=0.1), [first])
     with pytest.raises(TypeError, match=r"LazyAdam: parameters\[1\] is of type int; it must be a torch.Tensor"):

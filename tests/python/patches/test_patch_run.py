@@ -238,7 +238,7 @@ IN_FUNCTION = ("def render_{2}():\n    from {0} import GaussianRasterizationSett
 
 
 def test_each_package_is_told_by_its_own_calls(tmp_path, monkeypatch):
-    """Classes of the file's own are no rasterizer's, and one that is unknown is kept away where another is there."""
+    """Classes of the file's own are not a rasterizer's, and one that is unknown is kept away where another is there."""
     words = [sys.executable, "train.py"], "smoe", None, environment()
     known = (IN_FUNCTION.format("diff_gaussian_rasterization_abs", "image, radii, depth_image", 1, "antialiasing=1")
              + IN_FUNCTION.format("diff_gaussian_rasterization", "image, radii", 2, "")
@@ -479,6 +479,7 @@ image, alphas, meta = rasterization(means, torch.tensor([[1.0, 0, 0, 0]]), torch
                                     torch.ones(1, 3), view, K, 8, 8, packed=False)
 print(image.max().item() > 0.5, list(meta["radii"].shape))
 """
+INRIA_2024_IMPORT = "from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer\n"
 CALL_STRATEGY = """from gsplat.strategy import ops
 print(ops.compute_relocation.__module__, ops.quat_scale_to_covar_preci.__module__)
 """
@@ -498,6 +499,27 @@ def test_gsplat_gets_this_rasterizer_and_keeps_its_strategies(version, radii, tm
     ours = "diff_smoe_rasterization.integrations.gsplat"
     assert result.out.splitlines() == [f"True {radii}", *([f"{ours} {ours}"] if version else [])]
     assert "gsplat will be gsplat of this package, blend mode smoe" in result.err
+
+
+@pytest.mark.parametrize("main, module, chosen", [
+    ("from gsplat import rasterization\n", "gsplat", True), ("from gsplat import rasterization\n", "gsplat", False),
+    (INRIA_2024_IMPORT, "gsplat.rendering", True)])
+def test_another_rasterizer_of_gsplats_that_a_config_names_ends_the_command(main, module, chosen, tmp_path, python):
+    """It is told at the start, and nothing is trained by it."""
+    script = (f"{main}import {module}\nif {chosen}:\n    {module}.rasterization_2dgs(means=1)\n"
+              f"{CALL_GSPLAT}print('trained')\n")
+    make(tmp_path, {GR: None, "x.py": script})
+    installed = tmp_path / "installed"
+    for name, text in GSPLAT.items():
+        (installed / name).parent.mkdir(parents=True, exist_ok=True)
+        text = text.replace("import rasterization\n", "import rasterization, rasterization_2dgs\n")
+        text += "def rasterization_2dgs(*a, **k): print('2dgs')\n" if "def rasterization(" in text else ""
+        (installed / name).write_text(text.replace("{version}", "1.5.3"))
+    result = python("-m", "dsmoe", *RUN, "--", sys.executable, "x.py", cwd=tmp_path,
+                    PYTHONPATH=os.pathsep.join([str(PACKAGE_PARENT), str(installed)]))
+    assert "warning: the trainer may call gsplat's rasterization_2dgs, which this package has not" in result.err
+    assert result.status == chosen and result.out.endswith("trained\n") != chosen and "2dgs" not in result.out
+    assert ("the trainer calls gsplat's rasterization_2dgs, which this package has not; choose" in result.err) == chosen
 
 
 INRIA_2024 = ("from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer\n"

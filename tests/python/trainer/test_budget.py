@@ -132,6 +132,7 @@ def test_a_gaussian_takes_what_was_measured():
 
 @pytest.mark.parametrize("strategy, killed_at, settings", [
     ("importance", 14, ""), ("importance", 24, ""), ("importance", 24, "removals=4,views=5"), ("importance", 39, ""),
+    ("importance", 39, "move_views=2,pace=5"),
     ("importance", 56, ""), ("mcmc", 24, "")])
 def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, strategy, killed_at, settings):
     """Checkpoints at 10, 20, 30, 50 lie in growth, between removals, among moves and in the average.
@@ -181,6 +182,31 @@ def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
         names = sum((names for iteration, names in log.items() if first <= iteration <= last), [])
         assert len(names) == len(set(names)) == 5
     assert len(log) > len(decisions), "some by the steps' own renderings"
+
+
+def test_moves_look_at_as_many_views_and_come_as_often_as_they_are_told(tiny_config, monkeypatch):
+    """densify_until_iter is 30: with a pace of 5 moves are at multiples of 6 up to 40, behind the last removal, 25."""
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60, iterations=50,
+                         strategy_options="removals=4,views=5,move_views=2,pace=5")
+    strategy, seen, looked = trainer.strategy, [], {}
+    add, move, remove = strategy._add, strategy.move, strategy.remove
+
+    def logged(view, look):
+        seen.append(view.camera.name)
+        add(view, look)
+
+    def counted(decide):
+        def decision(*arguments):
+            decide(*arguments)
+            looked[trainer.iteration] = len(seen)
+            seen.clear()
+        return decision
+
+    monkeypatch.setattr(strategy, "_add", logged)
+    monkeypatch.setattr(strategy, "move", counted(move))
+    monkeypatch.setattr(strategy, "remove", counted(remove))
+    counts_of(trainer)
+    assert looked == {16: 5, 19: 5, 22: 5, 25: 5, 30: 2, 36: 2}
 
 
 def test_a_decision_looks_at_the_first_of_each_group_of_neighbours(tiny_config):
@@ -356,6 +382,33 @@ def test_what_two_views_or_fewer_need_moves(tiny_config, monkeypatch, settings, 
     assert moved == [expected]
 
 
+@pytest.mark.parametrize("views, enough", [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (6, 3), (7, 3)])
+def test_few_views_are_at_most_half_of_all(tiny_config, views, enough):
+    """With one or two training views every Gaussian else counted as free of cost, and any of them moved."""
+    scene = load_scene(tiny_config, progress=False)
+    assert len(scene.train) == 7
+    config = tiny_config.changed(strategy="importance", budget=60)
+    strategy = Trainer(config, dataclasses.replace(scene, train=scene.train[:views])).strategy
+    strategy.needed = (torch.arange(len(strategy.needed)) % (views + 1)).float()
+    assert torch.equal(strategy.is_of_few(), strategy.needed < enough)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_with_few_views_the_cheapest_move(tiny_config, views):
+    """A tenth, onto the largest error; every Gaussian has a cost of its own."""
+    scene = load_scene(tiny_config, progress=False)
+    config = tiny_config.changed(strategy="importance", budget=60, strategy_options="near=0,worth=1e9")
+    strategy = Trainer(config, dataclasses.replace(scene, train=scene.train[:views])).strategy
+    count = len(strategy.needed)
+    strategy.costs = costs = 1 + torch.randperm(count).float()
+    strategy.errors, strategy.needed, strategy.sought = torch.ones(count), torch.full((count,), float(views)), {}
+    moved = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(strategy, "split", lambda parents, rows: moved.extend(rows.tolist()))
+        strategy.move()
+    assert sorted(float(cost) for cost in costs[moved]) == [1.0 + row for row in range(int(0.1 * count))]
+
+
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_the_model_is_an_average_of_the_last_part(tiny_config, mode):
     """Behind step 42 of 60 of each step: of the first four the mean, then a quarter of each further one."""
@@ -421,7 +474,7 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
     costs, errors = torch.full((count,), 5.0), torch.zeros(count)
     costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
     strategy.needed += len(trainer.scene.train)
-    errors[7] = 1e6  # the cheapest is no place for another one
+    errors[7] = 1e6  # the cheapest is not a place for another one
     strategy.costs, strategy.errors = costs, errors
     monkeypatch.setattr(strategy, "_look_at_the_rest", lambda: None)
     moved = []
@@ -520,7 +573,8 @@ def test_settings_of_gate_are_checked(text, words):
 
 
 def test_settings_of_gate_are_of_gate_only():
-    text = "overshoot=0,removals=1,views=1000000,moves=0,worth=0,bands=1,needs=0,near=0,anneal=0.5,squares=0,average=0"
+    text = ("overshoot=0,removals=1,views=1000000,moves=0,move_views=1,pace=1,worth=0,bands=1,needs=0,near=0,"
+            "anneal=0.5,squares=0,average=0")
     assert TrainConfig(budget=60, strategy_options=text.replace(",", ", ")).validate()
     assert importance_settings(parse_importance_options(text)) == text
     with pytest.raises(ConfigError, match="--strategy-options is 'views=3'; it must be left out with --strategy mcmc"):

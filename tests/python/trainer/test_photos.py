@@ -183,7 +183,7 @@ def test_what_reading_would_wait_for_is_refused(tmp_path, capsys, monkeypatch):
     strange = tmp_path / "a.png"
     for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero"), lambda path: path.symlink_to("nothing")):
         make(strange)
-        assert f"{strange}: is no file that can be read (a pipe, " in fails(capsys, tmp_path, "-o", tmp_path / "scene")
+        assert f"{strange}: cannot be read as a file (a pipe, " in fails(capsys, tmp_path, "-o", tmp_path / "scene")
         strange.unlink()
     (tmp_path / "b.png").symlink_to("0.png")
     assert "pip install pycolmap" in fails(capsys, tmp_path, "-o", tmp_path / "scene")

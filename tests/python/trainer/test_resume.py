@@ -64,10 +64,12 @@ def killed_and_resumed(config, folder, killed_at, **options):
     return (straight, row), (broken, resumed)
 
 
-@pytest.mark.parametrize("blend_mode, killed_at", [("alpha", 26), ("smoe", 26), ("smoe", 11), ("smoe", 39)])
-def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, blend_mode, killed_at):
+@pytest.mark.parametrize("blend_mode, killed_at, half_until", [
+    ("alpha", 26, 0), ("smoe", 26, 0), ("smoe", 11, 0), ("smoe", 39, 0), ("smoe", 26, 25)])
+def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, blend_mode, killed_at, half_until):
     """Checkpoints are at 10, 20, 30; densifications at 8, 16, 24 and resets at 12, 24 lie on both sides."""
-    (straight, row), (broken, resumed) = killed_and_resumed(tiny_config, tmp_path, killed_at, blend_mode=blend_mode)
+    (straight, row), (broken, resumed) = killed_and_resumed(tiny_config, tmp_path, killed_at, blend_mode=blend_mode,
+                                                            half_until_iter=half_until)
     assert (resumed["psnr"], resumed["num_gaussians"]) == (row["psnr"], row["num_gaussians"])
     # The tiny scene must really have been densified, else nothing was shown.
     assert row["num_gaussians"] != row["protocol"]["init_points"]
@@ -402,7 +404,7 @@ def test_nothing_is_written_or_removed_where_a_link_leads_out_of_the_folder(tiny
     assert before == {path: os.path.getmtime(path) for path, _, _ in os.walk(elsewhere)}
     os.remove(path)
     os.symlink(str(tmp_path / "nowhere"), path)
-    with pytest.raises(TrainerError, match="nowhere.* by a link|point_cloud is no folder"):
+    with pytest.raises(TrainerError, match="nowhere.* by a link|point_cloud is not a folder"):
         train(config, overwrite=True, progress=False)
     os.rename(output, str(tmp_path / "real"))
     os.symlink(str(tmp_path / "real"), output)  # the folder itself may be one
@@ -728,7 +730,7 @@ def test_processes_do_not_share_an_unfinished_file_and_what_a_killed_one_left_go
 
 
 @pytest.mark.parametrize("what, make", [
-    ("a link", lambda path: os.symlink("precious", path)), ("no regular file", os.mkfifo), ("a folder", os.mkdir)])
+    ("a link", lambda path: os.symlink("precious", path)), ("not a regular file", os.mkfifo), ("a folder", os.mkdir)])
 def test_what_is_no_regular_file_is_never_replaced(tmp_path, what, make):
     path = str(tmp_path / "file")
     make(path)

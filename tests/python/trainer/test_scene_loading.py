@@ -359,7 +359,7 @@ def test_transforms_with_points_masks_and_listed_images(transforms_folder):
         scene = load(other)
         assert ["".join(view.camera.name[-5] for view in views) for views in (scene.train, scene.test)] == [train, test]
     edit_json(transforms_folder / "transforms.json", lambda content: content.update(test_filenames=["images/no.jpg"]))
-    refused(transforms_folder, "transforms.json", "`test_filenames` names images/no.jpg, which is no frame")
+    refused(transforms_folder, "transforms.json", "`test_filenames` names images/no.jpg, which is not a frame")
 
 
 @pytest.mark.parametrize("value", [-1, True, ["sparse_pc.ply"], float("nan"), {}])
@@ -520,7 +520,7 @@ def test_masks_that_do_not_fit(colmap_folder):
     shutil.rmtree(os.path.join(colmap_folder, "masks"))
     with open(os.path.join(colmap_folder, "masks"), "w", encoding="utf-8") as file:
         file.write("not a folder")
-    refused(colmap_folder, "masks", "is no folder")
+    refused(colmap_folder, "masks", "is not a folder")
 
 
 def test_an_unreadable_image(colmap_folder):

@@ -174,12 +174,12 @@ def test_a_training_that_is_replaced_is_followed(tiny_scene, tmp_path):  # noqa:
     ("http://evil.example", "127.0.0.1:8080", "a page of 'http://evil.example' asks"),
     ("http://localhost:3000", "localhost:8080", "a page of 'http://localhost:3000' asks"),
     ("null", "localhost:8080", "a page of 'null' asks"),
-    ("http://evil.example:8080", "evil.example:8080", "'evil.example:8080' is no name of this machine"),
-    ("http://localhost.evil.example", "localhost.evil.example", "no name of this machine"),
-    *((f"http://{host}", host, "no name of this machine") for host in (
+    ("http://evil.example:8080", "evil.example:8080", "'evil.example:8080' is not a name of this machine"),
+    ("http://localhost.evil.example", "localhost.evil.example", "not a name of this machine"),
+    *((f"http://{host}", host, "not a name of this machine") for host in (
         "[::1]evil.example", "[::1].evil.example:8080", "[::1]:8080.evil.example", "[localhost]", "[::1", "::1]",
         "localhost:80:evil.example", "localhost:evil.example", "[::1]:80x", "[[::1]]", "[]", "", "[evil.example]")),
-    (None, None, "None is no name of this machine")])
+    (None, None, "None is not a name of this machine")])
 def test_pages_of_others_are_refused(origin, host, words):
     why = refusal(origin, host, "gpu7")
     assert why is None if words is None else words in why
