@@ -33,7 +33,7 @@ FOLDER = GR.partition("/")[0]
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 IMPORTS_RASTERIZER = re.compile(rb"(?m)^\s*((from|import) (\w*diff_(gauss|surfel|plane)|gsplat\b)"
                                 rb"|from (?!diff_smoe_)\w+ import .*GaussianRasteriz)")
-CALLS_BY_TEXT = re.compile(rb"\bglobals\(|\beval\(|\bgetattr\((\w|\.)+, *\w")  # a function may be made up as text
+CALLS_BY_TEXT = re.compile(rb"\bglobals\(|(?<![.\w])eval\(|\bgetattr\((\w|\.)+, *\w")  # by a made-up name
 SPARSE_ADAM, ASKS_FOR_SPARSE_ADAM = "SparseGaussianAdam", "sparse_adam"
 BY_DEFAULT = re.compile(rb"\boptimizer_type\s*(:\s*\w+\s*)?=\s*['\"]" + ASKS_FOR_SPARSE_ADAM.encode())
 USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its rasterizer is called with",
