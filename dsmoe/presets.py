@@ -52,7 +52,7 @@ def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Di
     named = {part.partition("=")[0].strip() for part in given.split(",")}
     settings = [part for part in preset.settings.split(",") if part.partition("=")[0] not in named]
     parts = {name: max(2, round(part * iterations)) for name, part in preset.parts.items()}
-    return {**parts, "iterations": iterations, **options,
+    return {"iterations": iterations, **parts, **options,
             "strategy_options": ",".join(filter(None, [given, *settings]))}
 
 
