@@ -32,7 +32,7 @@ FAST = {"cuda": Preset(8400, "overshoot=1.5,removals=4,pace=10", {"densify_until
         "cpu": Preset(3000, "overshoot=1.5,removals=4", {"densify_until_iter": 0.35})}
 BEST = Preset(60_000, "views=255")
 PRESETS = {"fast": FAST, "best": {"cuda": BEST, "cpu": BEST}}
-NUMBERS = {"cuda": Numbers(3, 20_000, 300_000, 100_000, 1_000_000),
+NUMBERS = {"cuda": Numbers(3, 20_000, 300_000, 200_000, 1_000_000),
            "cpu": Numbers(1, 10_000, 60_000, 20_000, 100_000)}
 
 
