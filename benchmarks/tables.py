@@ -129,18 +129,14 @@ def recipe_cells() -> Dict[Tuple[str, float], Dict[str, List[Row]]]:
 
 
 def recipe_table() -> str:
-    """A line for each scene and threshold: PSNR and number; what smoe gains near edges; two other rules less alpha."""
+    """A line for each scene and threshold: PSNR and number; what smoe gains near edges."""
     lines = []
     for (scene, threshold), rules in recipe_cells().items():
         line = [f"{scene} {threshold:g}", *(f"{shown(rules[blend], 'psnr', 2)}, {thousands(rules[blend])}"
                                             for blend in BLENDS)]
         line.append(signed(less(rules["smoe"], rules["alpha"], "psnr_edge"), 1))
-        for rule in ("gate 0", "Eq. 7"):
-            cells = rules.get(rule)
-            line.append(f"{signed(less(cells, rules['alpha'], 'psnr'), 1)}, {signed(-fewer(cells, rules['alpha']), 0)}%"
-                        if cells else "–")
         lines.append(line)
-    return table(["", "alpha", "smoe", "near edges", "λ = 0, all pairs", "Eq. 7"], lines)
+    return table(["", "alpha", "smoe", "near edges"], lines)
 
 
 def number_at(points: Sequence[Tuple[float, float]], psnr: float) -> Optional[float]:
@@ -206,6 +202,43 @@ def trainers_table() -> str:
     return table(["", "sparse: bonsai", "sparse: fox", "dense: bonsai", "dense: fox"], lines)
 
 
+ABLATED = {"smoe_tn": "without T in the denominator (Eq. 8)", "smoe_std": "without T (Eq. 6)"}
+
+
+def ablations() -> Dict[Tuple[float, str], List[Row]]:
+    """bonsai by the ablations and by Eq. 7, whose cut is the same: rows by threshold and blend."""
+    rows = [row for row in rows_of("tails_h100.jsonl") + rows_of("near_h200.jsonl")
+            if row["scene"] == "bonsai" and row["strategy"] == "3dgs" and row["background_gate"] == 0
+            and row["densify_grad_threshold"] in (0.005, 0.0002)]
+    return {key: cells for key, cells in grouped(rows, "densify_grad_threshold", "blend_mode").items()  # type: ignore
+            if key[1] in ("smoe_eq7", *ABLATED)}
+
+
+def transmittance_table() -> str:
+    cells = ablations()
+    return table(["bonsai", "Eq. 7", *ABLATED.values()], (
+        [f"{end:g}", *(f"{shown(cells[end, blend], 'psnr', 2)}, {thousands(cells[end, blend])}"
+                       for blend in ("smoe_eq7", *ABLATED))] for end in (0.005, 0.0002)))
+
+
+RULES = {"alpha": "alpha", "learned": "smoe", "program": "the authors' program"}
+
+
+def timed() -> Dict[Tuple[str, str], Row]:
+    """Trainings by the recipe at 0.0002 that were alone on a card, by scene and rule."""
+    rows = [row for row in rows_of("paper_suites_h200.jsonl") if row["suite"] == "fig5"]
+    return {(row["scene"], "alpha" if row["blend_mode"] == "alpha" else "learned" if row["background_gate"] == "learned"
+             else "program"): row for row in rows}
+
+
+def time_table() -> str:
+    """Seconds of training, FPS, Gaussians and PSNR of single runs."""
+    found = timed()
+    return table(["0.0002", *(f"{name}: s, FPS, Gaussians, PSNR" for name in RULES.values())], (
+        [scene, *(f"{row['train_seconds']:.1f}, {row['fps']:.0f}, {thousands([row])}, {row['psnr']:.2f}"
+                  for row in (found[scene, rule] for rule in RULES))] for scene in ("bonsai", "fox")))
+
+
 def first_table() -> str:
     """The README's: from alpha to smoe."""
     cells, rows = recipe_cells(), trainings()
@@ -214,11 +247,14 @@ def first_table() -> str:
               "fox, 50 photographs by a phone, the same": [cells["fox", 0.0002][blend] for blend in BLENDS],
               "bonsai, as many Gaussians": [budgets["bonsai", 30_000, blend] for blend in BLENDS],
               "lego, an object in empty space": [cells["lego", 0.0002][blend] for blend in BLENDS]}
-    lines = []
+    runs, lines = timed(), []
     for name, (alpha, smoe) in chosen.items():
         numbers = dict.fromkeys((thousands(alpha), thousands(smoe)))
-        lines.append([name, f"{shown(alpha, 'psnr', 2)} to {shown(smoe, 'psnr', 2)} dB", " to ".join(numbers)])
-    return table(["alpha to smoe", "PSNR", "Gaussians"], lines)
+        seconds = [f"{runs[alpha[0]['scene'], rule]['train_seconds']:.1f}" for rule in ("alpha", "learned")
+                   if (alpha[0]["scene"], rule) in runs and not alpha[0]["budget"]]
+        lines.append([name, f"{shown(alpha, 'psnr', 2)} to {shown(smoe, 'psnr', 2)} dB", " to ".join(numbers),
+                      f"{' to '.join(seconds)} s" if seconds else "–"])
+    return table(["alpha to smoe", "PSNR", "Gaussians", "training"], lines)
 
 
 BOUNDS = (30.0, 31.0, 31.5)  # dB, of the race
@@ -279,19 +315,19 @@ def span(values: Iterable[float], digits: int = 0, sign: str = "") -> str:
 def sentences() -> Dict[str, List[str]]:
     """What the pages say in sentences: a page has each of its texts, whatever the breaks of lines."""
     cells = recipe_cells()
-    budgets = [grouped(found, "blend_mode") for found in
-               grouped((row for row in trainings() if row["budget"]), "scene", "budget").values()]
-    gains = [less(found["smoe",], found["alpha",], "psnr") for found in budgets]
+    by_budget = {key: grouped(found, "blend_mode") for key, found in
+                 grouped((row for row in trainings() if row["budget"]), "scene", "budget").items()}
+    gains = [less(found["smoe",], found["alpha",], "psnr") for found in by_budget.values()]
     saved = {scene: span(100 * (1 - smoe / alpha) for name, _, alpha, smoe in levels() if name == scene)
              for scene in LEVELS}
     few = f"{saved['bonsai']} % fewer Gaussians on bonsai and {saved['fox']} % on fox"
     equal = f"{span(gains, 2)} dB"
     faster = {name: [] for name in ("fastergs", "gsplat unpacked")}  # type: Dict[str, List[float]]
     for model in ("bonsai", "g7", "g40"):
-        timed = {row["renderer"]: row for row in json.loads(
+        measured = {row["renderer"]: row for row in json.loads(
             (RESULTS / f"rasterizer_h200_{model}.json").read_text(encoding="utf-8"))["rows"]}
         for name, ratios in faster.items():
-            ratios.append(timed[name]["total_ms"] / timed["ours alpha"]["total_ms"])
+            ratios.append(measured[name]["total_ms"] / measured["ours alpha"]["total_ms"])
     ours = [line[4] for line in race_lines() if "--budget" in line[0]]
     lite = next(line[4] for line in race_lines() if "LiteGS" in line[0])
     many = times_as_many(trainings())
@@ -301,22 +337,50 @@ def sentences() -> Dict[str, List[str]]:
     models = json.loads((RESULTS / "rasterizer_h100_smoe_models.json").read_text(encoding="utf-8"))
     slower = span([row["ratio"] for row in models if (row["rule"], row["version"]) == ("smoe", "the new rule")], 2)
     authors = [less(cells[LEGO, end]["alpha"], cells[LEGO, end]["gate 0"], "psnr") for end in (0.005, 0.001, 0.0002)]
-    ablated = [less(cells["bonsai", row["densify_grad_threshold"]]["Eq. 7"], [row], "psnr")
-               for row in rows_of("tails_h100.jsonl") + rows_of("near_h200.jsonl")
-               if row["blend_mode"] in ("smoe_tn", "smoe_std")]
+    by_end = ablations()
+    ablated = [less(by_end[end, "smoe_eq7"], by_end[end, blend], "psnr") for end in (0.005, 0.0002)
+               for blend in ABLATED]
+    runs = timed()
+    slower_fps = {rule: span([100 * (1 - runs[scene, rule]["fps"] / runs[scene, "alpha"]["fps"])
+                              for scene in ("bonsai", "fox")]) for rule in ("learned", "program")}
+    longer = span([100 * (runs[scene, "program"]["train_seconds"] / runs[scene, "alpha"]["train_seconds"] - 1)
+                   for scene in ("bonsai", "fox")])
+    dense_saved = [fewer(cells[scene, 0.0002]["gate 0"], cells[scene, 0.0002]["alpha"]) for scene in CAPTURES]
+    sparse_gained = [less(cells[scene, 0.005]["gate 0"], cells[scene, 0.005]["alpha"], "psnr") for scene in CAPTURES]
+    text = {key: rules for key, rules in cells.items() if "Eq. 7" in rules}
+    text_gains = {key: less(rules["Eq. 7"], rules["alpha"], "psnr") for key, rules in text.items()}
+    bonsai = [key for key in text if key[0] == "bonsai" and key[1] < 0.005]
+    edges = {scene: [less(found["smoe",], found["alpha",], name) for name in ("psnr_edge", "psnr")]
+             for (scene, budget), found in by_budget.items() if (scene, budget) in (("fox", 4000), ("room35", 5700))}
+    plugged = grouped(rows_of("trainers_tails_h100.jsonl") + rows_of("trainers_tails_h200.jsonl"),
+                      "trainer", "density", "scene", "blend_mode")
+    kept = span(fewer(plugged[name, "dense", scene, "smoe"], plugged[name, "dense", scene, "alpha"])
+                for name in ("3dgs-2023", "c3dgs") for scene in ("bonsai", "fox"))
     return {
         "README.md": [
-            few, equal, f"{slower} times as long as by `alpha`", f"loses {span(authors, 1)} dB",
+            f"keep their quality with {kept} % fewer Gaussians",
+            few, equal, f"{slower_fps['learned']} % slower", f"loses {span(authors, 1)} dB",
             f"bonsai loses {span(ablated, 1)} dB", f"Lego loses {-lego[-1]:.2f} dB",
             f"in {ours[0]} s by alpha and {ours[1]} s by smoe, where LiteGS takes {lite}",
             f"{span(faster['fastergs'], 1)} times as fast as Faster-GS",
             f"{span(faster['gsplat unpacked'], 1)} times as fast as gsplat"],
         "benchmarks/RESULTS.md": [
+            f"{span(sparse_gained, 1, '+')} dB", f"**yes:** {span(dense_saved)} % fewer",
+            f"gains {text_gains['bonsai', 0.005]:.1f} dB at 0.005",
+            f"{span(fewer(text[key]['Eq. 7'], text[key]['alpha']) for key in bonsai)} % fewer Gaussians than alpha and "
+            f"{span((-text_gains[key] for key in bonsai), 1)} dB less",
+            f"On fox it loses {span((-gain for key, gain in text_gains.items() if key[0] == 'fox'), 1)} dB",
+            "edges gain {:.2f} where pictures gain {:.2f} dB on fox".format(*edges["fox"]),
+            "{:.2f} for {:.2f} on room35".format(*edges["room35"]),
             few, equal, f"At 0.0002 smoe has {-statistics.fmean(dense):.0f} % fewer Gaussians",
             f"at 0.005 it gains {span(sparse, 1)} dB", f"lego by {span(lego, 1, '+')} dB",
             f"lego loses {span(authors, 1)} dB", f"bonsai loses {span(ablated, 1)} dB",
             f"{slower} times as long as alpha", f"{span(many[30_000] + many[100_000], 1)} times as many",
-            f"{span(many[10_000], 1)} times as many"],
+            f"{span(many[10_000], 1)} times as many", f"{slower_fps['learned']} % slower",
+            f"{slower_fps['program']} % slower", f"trains {longer} % longer"],
+        "docs/paper.md": [
+            few.replace("fewer Gaussians ", ""), f"{-ablated[2]:.1f} and {-ablated[3]:.1f} dB against Eq. 7",
+            f"{slower_fps['program']} % slower", f"lose up to {max(authors):.0f} dB"],
     }
 
 
@@ -367,6 +431,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = trainings()
     for text in (first_table(), levels_table(), budget_table(rows), recipe_table(), table_1(), trainers_table(),
+                 time_table(), transmittance_table(),
                  rules_table(), race_table(),
                  *(f"{page}: {text}" for page, texts in sentences().items() for text in texts)):
         print(text, end="\n\n")

@@ -116,8 +116,8 @@ class LazyAdam:
         self._count_step(age)  # behind the op: if it refuses radii no step is counted
         self.end()
 
-    # The same in two parts: the host's, and the launches', which read their numbers in memory of the device. So a loop
-    # may capture the launches in a CUDA graph, and make the host's part at each replay.
+    # The same in two parts: the host's, and the launches, which read their numbers from device memory. So a loop can
+    # capture the launches in a CUDA graph, and do the host's part before each replay.
 
     def begin_catch_up(self) -> int:
         """The host's part of `catch_up(radii)`; returns the number that `launch_catch_up` reads."""
@@ -150,7 +150,7 @@ class LazyAdam:
         _OPS.lazy_adam_step(self._marks, self._rates, 0, zeros, zeros, radii, steps, rates)
 
     def end(self) -> None:
-        """Notes that what has changed up to here was the caller's launches; after both of them, captured or not."""
+        """Accepts the changes up to here as the caller's launches. Call it after both, captured or not."""
         self._left = [(tensor, tensor._version) for tensor in self._tensors() if tensor is not None]
         self._left_ages = self._ages()
 

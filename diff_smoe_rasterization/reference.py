@@ -493,7 +493,7 @@ def tail_sum(splats, x, y, counts, alpha, settings, mode, wide):
 
 
 def pair_alphas(splats, x, y, counts):
-    """Returns the gate logits alpha_i = min(0.99, o_i G_i) (Eq. 1) [n, pixels], 0 for pairs that do not count.
+    """Returns alpha_i = min(0.99, o_i G_i) (Eq. 1) [n, pixels], 0 for pairs that do not count.
 
     Those pairs are moved to the centre first: far away their derivatives overflow, and 0 times infinity is NaN.
     """

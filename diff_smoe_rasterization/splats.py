@@ -13,9 +13,9 @@ _OPS = torch.ops.diff_smoe_rasterization
 
 
 class Splats:
-    """N Gaussians on the image plane of one rendering, and its lists of those that each tile shows.
+    """N Gaussians on the image plane of one rendering, and the list of Gaussians of each tile.
 
-    Nothing here has a gradient. What a culled Gaussian (radius 0) has is 0 everywhere.
+    Nothing here has a gradient. Every value of a culled Gaussian (radius 0) is 0.
     """
 
     def __init__(self, images: Sequence[torch.Tensor], saved: Sequence[torch.Tensor],
@@ -63,12 +63,12 @@ class Splats:
         Both are of the Gaussians' type and device. The colour image, and the alpha image if it was asked for, must
         be as they were rendered: an image that was edited in place since gives other numbers.
 
-        The removal's image is that of a rendering without the Gaussian, but for two things. Which pairs of a pixel
-        count by `faint_below`, and in `smoe` the sum of its tails, stay as they are. And behind a pixel that was full
-        (T < 1e-4) nothing is known. Without one of its Gaussians such a pixel may take more, of a weight below T / (1 -
-        alpha). If nothing else is in a pixel, it shows the background's colour.
+        The cost is the change to a rendering without the Gaussian, with two exceptions. Which pairs of a pixel count by
+        `faint_below`, and in `smoe` the sum of its tails, stay as they are. Gaussians behind a full pixel (T < 1e-4)
+        are ignored; without one in front their weight could be up to T / (1 - alpha). A pixel with nothing else shows
+        the background's colour.
 
-        Sums are exact and reproducible as those of `contributions`. Raises ValueError or TypeError if a map does not
+        Sums are as exact and reproducible as in `contributions`. Raises ValueError or TypeError if a map does not
         fit.
         """
         if pixel_weights is None:

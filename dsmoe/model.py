@@ -36,7 +36,7 @@ def are_numbers(name: str, values: torch.Tensor) -> torch.Tensor:
 
 
 def finite_rows(raw: Dict[str, torch.Tensor]) -> torch.Tensor:
-    """[N] bool: the Gaussians that can be shown, all numbers of which can be used."""
+    """[N] bool: the Gaussians that can be shown: every number of theirs can be used."""
     rows = [are_numbers(name, tensor.detach()).flatten(1).all(1) for name, tensor in raw.items()]
     return torch.stack(rows).all(0)
 
@@ -71,7 +71,7 @@ class GaussianModel:
 
     @classmethod
     def from_gaussians(cls, raw: Dict[str, torch.Tensor], sh_degree: int) -> GaussianModel:
-        """Trained Gaussians, all of whose harmonics are active; sh_degree: to which they are cut or filled with 0."""
+        """Trained Gaussians, with all harmonics active, cut or filled with 0 to sh_degree."""
         shs, bands = raw["shs"], (sh_degree + 1) ** 2 - 1
         there = shs.shape[1]
         filled = torch.cat([shs[:, :bands], shs.new_zeros(len(shs), max(0, bands - there), 3)], 1)

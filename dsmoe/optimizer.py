@@ -56,12 +56,12 @@ class GaussianOptimizer:
         return self.group("means3D")["lr"]
 
     def scale_rate(self, name: str, factor: float) -> None:
-        """Multiplies what the options say of one learning rate, which is not the positions'."""
+        """Sets one learning rate, not the positions', to its option times the factor."""
         self.rates[name] *= factor
         self.group(name)["lr"] = self.rates[name]
 
     def scale_other_rates(self, factor: float) -> None:
-        """Sets the learning rates of all but the positions to a part of what the options say."""
+        """Sets all learning rates except the positions' to their options times the factor."""
         for name in PARAMETERS[1:]:
             self.group(name)["lr"] = factor * self.rates[name]
 
@@ -100,8 +100,7 @@ class GaussianOptimizer:
     def take(self, rows: torch.Tensor, new: Optional[Dict[str, torch.Tensor]] = None) -> None:
         """Puts these rows [M] of Gaussians in place of all, in one pass over memory.
 
-        new: raw parameters of the last ones, if they differ from those of their rows. As many of the last ones begin
-        without moments.
+        new: raw parameters of the last rows, in place of those that were there. These rows begin without moments.
         """
         new = new or {}
         fresh = max((len(values) for values in new.values()), default=0)

@@ -13,8 +13,8 @@ class Preset(NamedTuple):
     """Options in place of defaults; those that are given win."""
 
     iterations: int
-    until: float  # densify_until_iter, as a part of the iterations
     settings: str  # of --strategy-options
+    parts: Dict[str, float] = {}  # options that are these parts of the iterations
     options: Dict[str, Any] = {}
 
 
@@ -28,9 +28,10 @@ class Numbers(NamedTuple):
     most_points: int  # to start from
 
 
-FAST = {"cuda": Preset(7000, 0.35, "overshoot=1.5,removals=4"),
-        "cpu": Preset(3000, 0.35, "overshoot=1.5,removals=4")}  # growth and removals early: much is left to settle
-BEST = Preset(60_000, 0.5, "views=255", {"scaling_lr": 0.02})
+# Growth and removals are early: much is left to settle.
+FAST = {"cuda": Preset(7000, "overshoot=1.5,removals=4", {"densify_until_iter": 0.35}),
+        "cpu": Preset(3000, "overshoot=1.5,removals=4", {"densify_until_iter": 0.35})}
+BEST = Preset(60_000, "views=255", options={"scaling_lr": 0.02})
 PRESETS = {"fast": FAST, "best": {"cuda": BEST, "cpu": BEST}}
 NUMBERS = {"cuda": Numbers(3, 20_000, 300_000, 100_000, 1_000_000),
            "cpu": Numbers(1, 10_000, 60_000, 20_000, 100_000)}
@@ -51,8 +52,9 @@ def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Di
     given = options.get("strategy_options", "")
     named = {part.partition("=")[0].strip() for part in given.split(",")}
     settings = [part for part in preset.settings.split(",") if part.partition("=")[0] not in named]
-    return {**preset.options, "iterations": iterations, "densify_until_iter": max(2, round(preset.until * iterations)),
-            **options, "strategy_options": ",".join(filter(None, [given, *settings]))}
+    parts = {name: max(2, round(part * iterations)) for name, part in preset.parts.items()}
+    return {**preset.options, **parts, "iterations": iterations, **options,
+            "strategy_options": ",".join(filter(None, [given, *settings]))}
 
 
 def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, Any]:

@@ -35,6 +35,7 @@ PART = ".dsmoe_part-"  # begins the name of a folder with a file that is not who
 DAMAGE = (ValueError, OverflowError, RecursionError, OSError)
 _kept = False
 _told: Set[str] = set()
+_models_read: Dict[str, Record] = {}  # by the file's name, the latest one last
 
 
 class Record(NamedTuple):
@@ -100,8 +101,13 @@ def _wrap_load(owner: Any, name: str, keyword: str, is_model: Callable[[Any], bo
 
 
 def recorded() -> Dict[str, Any]:
-    """Returns what files of this process record; {} in `alpha`, and where a learned gate is not known yet."""
+    """Returns what files of this process record; {} in `alpha`, and where a learned gate is not known yet.
+
+    A process that renders nothing, such as one that merges models, records what the models record that it has read.
+    """
     own = blend_of_process()
+    if _models_read and not gate.renders and (own is None or own.background_gate == settings.LEARNED):
+        own = _of_models_read()
     if not own or own.blend_mode == "alpha":
         return {}
     if own.background_gate == settings.LEARNED:
@@ -109,6 +115,16 @@ def recorded() -> Dict[str, Any]:
             return {}  # nothing was rendered with it
         own = own._replace(background_gate=gate.value(), learned=None if gate.frozen else gate.state_dict())
     return {name: value for name, value in own._asdict().items() if value is not None}
+
+
+def _of_models_read() -> Record:
+    """Returns the record of the model that was read last, and says so if another one differs."""
+    *_, last = _models_read.values()
+    if any(record[:3] != last[:3] for record in _models_read.values()):
+        found = "; ".join(f"{name}: {_said_of(record)}" for name, record in _models_read.items())
+        _warn("what this process saves", f"the models that it has read differ ({found}), and it records the last one's "
+                                         "blend; options say another")
+    return last
 
 
 def blend_of_process() -> Optional[Record]:
@@ -283,6 +299,9 @@ def _take(file: Any, said: Callable[[], Any], is_model: bool) -> None:
         record = None if found is None else checked(found)
     except (KeyError, TypeError, *DAMAGE) as error:
         damage = f"its record of mode and gate is damaged ({type(error).__name__}: {error})"
+    if record and is_model:
+        _models_read.pop(name, None)
+        _models_read[name] = record
     if own is None:  # its settings say it
         own = record._replace(background_gate=settings.LEARNED) if record else Record("alpha")
     is_learned, same_mode = own.background_gate == settings.LEARNED, record and record.blend_mode == own.blend_mode

@@ -207,9 +207,9 @@ def _of_gsplat(nodes: Sequence[ast.AST]) -> Iterator[str]:
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
-    """Returns the rasterizer whose API is called and "", or None and why it is none that is known.
+    """Returns the rasterizer whose API is called and "", or None and why it is unknown.
 
-    Of several it is that of RASTERIZER's name, or else the first.
+    Of several, the package named RASTERIZER, else the first.
     """
     foreign = sorted(those(facts, "uses "))
     if foreign:
@@ -236,8 +236,8 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
 def contracts_of(facts: Set[str]) -> Tuple[Dict[str, Contract], str]:
     """Returns for each package that is imported as a rasterizer which one it is, and "".
 
-    Where one of them is none that is known: {} and why. One whose name is unknown too, and that is imported only in a
-    branch or a function, beside another that always is, is left out: see `blocked`.
+    If one of them is unknown: {} and why. Left out is a package of unknown name that is imported only in a branch or a
+    function, beside one that is always imported: see `blocked`.
     """
     imported = sorted(packages(facts), key=lambda name: (name != RASTERIZER, name)) or [RASTERIZER]
     found, reasons = {}, {}
@@ -278,7 +278,7 @@ def _contract_of(package: str, facts: Set[str]) -> Tuple[Optional[Contract], str
     if package != RASTERIZER and package not in MODULES and not returned + perhaps:
         return None, (f"it imports {package}, and what a call returns is not seen: if it has the API of a rasterizer "
                       f"that is known here, name that one by --trainer; {OF_ALL}")
-    named = [MODULES[package]] if package in MODULES else []  # its name may be that of one, and its API another's
+    named = [MODULES[package]] if package in MODULES else []  # its name may be one rasterizer's, and its API another's
     shown = named + [contract for contract in CONTRACTS if contract.module == RASTERIZER
                      and (not contract.signs or facts & set(contract.signs))] * bool(returned + perhaps or not named)
     fitting = [contract for contract in shown if used <= _known(contract)]
@@ -372,7 +372,7 @@ def _fits(found: str, contract: Contract) -> bool:
 
 
 def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
-    """Returns the trainer and "", or None and why it is none that is known."""
+    """Returns the trainer and "", or None and why it is unknown."""
     contract, reason = contract_of(facts)
     if contract is None:
         return None, reason

@@ -60,7 +60,7 @@ def find_suite(name: str) -> str:
 
 def load_suite(path: str, device: Optional[str] = None, iterations: Optional[int] = None,
                scenes: Optional[str] = None, methods: Sequence[str] = ()) -> Suite:
-    """As `expand`, of a file. scenes: a file of scenes in place of the suite's, or the name of one that is shipped."""
+    """`expand` of a file. scenes: a file of scenes to use instead of the suite's, or the name of a shipped one."""
     content, folder = read_yaml(path), os.path.dirname(os.path.abspath(path))
     if scenes is not None and isinstance(content, dict):
         found = scenes if os.path.isfile(scenes) else SCENES.get(scenes)
@@ -134,7 +134,7 @@ def refuse(wrong: Any, words: str) -> None:
 def read_yaml(path: str) -> Any:
     """What a YAML file says. Raises BenchError."""
     class Loader(yaml.SafeLoader):
-        """Of a key that is there twice YAML keeps the last, without a word."""
+        """Refuses a key that is there twice: YAML would keep the last one silently."""
 
         def compose_mapping_node(self, anchor: Any) -> Any:
             node = super().compose_mapping_node(anchor)
@@ -302,7 +302,7 @@ def _cells(content: Values, protocol: Values, scene: Values, method: Values, axe
 
 
 def said_of(cell: Values, field: str) -> Any:
-    """What a cell has of a field, by the word that a suite has for it."""
+    """A cell's value of a field, by the field's name in a suite."""
     return PAPER if field == "blend_mode" and is_paper(cell) else cell.get(field, UNSAID.get(field))
 
 

@@ -1,8 +1,8 @@
 """A batch of views of Gaussians that are divided over processes: footprints go to where a view is blended.
 
 Every process projects its own Gaussians for all views and sends what a view sees to the process that blends it. The
-gradients by those footprints come back, and each process makes of them the gradients of its own Gaussians. A process
-by itself does the same without sending.
+gradients of those footprints come back, and each process computes the gradients of its own Gaussians from them. A
+single process does the same without sending.
 """
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class DrawnImage:
 class Batch:
     """The views of one step, from projection to gradients.
 
-    They are blended in rounds, in each of which a process has at most one view. What the next rounds need is sent
-    meanwhile, and so is what the rounds before have found. A process's part of all Gaussians is a run of their order,
-    so that the rows of a view, process by process, are in that order too.
+    They are blended in rounds; in each a process has at most one view. Meanwhile the rows of the next rounds and the
+    gradients of earlier ones are sent. Each process holds a consecutive part of all Gaussians, so that the rows of a
+    view, process by process, keep the Gaussians' order.
     """
 
     def __init__(self, group: Group, model: GaussianModel, settings: Sequence[GaussianRasterizationSettings],

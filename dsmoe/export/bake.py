@@ -20,7 +20,7 @@ from ..training.strategy import Step, Strategy, StrategyContext
 from ..training.trainer import Trainer
 
 RISE = 0.4  # the part of the iterations in which the background gate goes to 1
-LEAST_GATE = 0.01  # begins in place of 0, which no factor raises
+LEAST_GATE = 0.01  # a gate of 0 starts here, because no factor raises 0
 
 
 class Baked(NamedTuple):
@@ -72,7 +72,7 @@ class _Baking(Run):
         return "baking to alpha"
 
     def save_checkpoint(self) -> None:
-        """Only looks whether one could be written."""
+        """Writes nothing; only raises if a checkpoint could not be written."""
         self._state()
 
     def _write_results(self) -> Dict[str, Any]:

@@ -64,7 +64,7 @@ def check_output(path: str, overwrite: bool = True) -> None:
     except (OSError, ValueError) as error:
         raise TrainerError(f"{path}: cannot be written ({getattr(error, 'strerror', error)})") from error
     if not stat.S_ISREG(mode):
-        what = "a link" if stat.S_ISLNK(mode) else "a folder" if stat.S_ISDIR(mode) else "no regular file"
+        what = "a link" if stat.S_ISLNK(mode) else "a folder" if stat.S_ISDIR(mode) else "not a regular file"
         raise TrainerError(f"{path} is {what}, which is never replaced; move it, or choose another name with -o")
     if not overwrite:
         raise TrainerError(f"{path} is there already; --overwrite replaces it, or choose another name with -o")

@@ -156,7 +156,7 @@ def write_record(folder: str, command: str, record: Record, earlier: Collection[
     """Records what is about to be written, and removes what of `earlier` is not.
 
     earlier: files that the command has written before. Raises TrainerError if another file is in the way, which
-    `overwrite` lets be replaced, and if what is there is no regular file.
+    `overwrite` lets be replaced, and if what is there is not a regular file.
     """
     check_inside(folder, record.files)
     for name in record.files:

@@ -233,8 +233,8 @@ TEST(ColmapErrors, OfBinaryFilesNameByteAndReason) {
   EXPECT_NO_THROW(images(image_bytes(1, 0, "a.jpg")));
   expect_error(images, huge, "1152921504606846976");
   expect_error(images, image_bytes(0, 0, "a.jpg"), "image 5 \"a.jpg\" has a qvec that is not a rotation");
-  expect_error(images, image_bytes(kNan, 0, "a.jpg"), "no rotation");
-  expect_error(images, image_bytes(1e200, 0, "a.jpg"), "no rotation");
+  expect_error(images, image_bytes(kNan, 0, "a.jpg"), "not a rotation");
+  expect_error(images, image_bytes(1e200, 0, "a.jpg"), "not a rotation");
   expect_error(images, image_bytes(1, kNan, "a.jpg"), "nan in its tvec");
   expect_error(images, image_bytes(1, 0, ""), "number of images");  // too small a file for one image
   expect_error(images, image_bytes(1, 0, "") + "x", "no usable name");
@@ -263,7 +263,7 @@ TEST(ColmapErrors, OfTextFilesNameLineAndReason) {
   expect_error(cameras, "4294967296 PINHOLE 8 8 1 1 4 4", "id is \"4294967296\"");
   expect_error(images, "1 1 0 0 0 0 0 0", "camera id is missing");
   expect_error(images, "1 1 0 0 0 0 0 0 1", "no usable name");
-  expect_error(images, "1 0 0 0 0 0 0 0 1 a.jpg", "no rotation");
+  expect_error(images, "1 0 0 0 0 0 0 0 1 a.jpg", "not a rotation");
   expect_error(images, "1 1 0 0 0 0 0 0 1 a" + std::string(1, '\0') + ".jpg", "no usable name");
   expect_error(points, "1 0 0 inf 1 2 3 0", "coordinate inf");
   expect_error(points, "1 0 0 0 256 2 3 0", "colour is \"256\"");

@@ -95,16 +95,6 @@ def test_every_file_of_the_map_and_of_the_method_is_there():
         assert len(paths) > 5 and not [path for path in paths if not (ROOT / path).exists()], page
 
 
-def test_the_figures_of_the_tools_are_those_of_their_page():
-    """Figures 2, 3 and 10, which docs/tools.md has with their commands."""
-    tools = (ROOT / "docs" / "tools.md").read_text(encoding="utf-8")
-    text = PAPER.read_text(encoding="utf-8")
-    for first in ("2", "3", "10"):
-        row, = rows_of(text, first)
-        for figure in re.findall(r"\d+\.\d\d", row.rpartition("`")[2]):
-            assert figure in tools, f"Figure {first}: {figure} dB"
-
-
 @pytest.mark.skipif(not any(tables.RESULTS.glob("*.jsonl")),
                     reason="the rows are in the repository, not in its source distribution")
 def test_what_the_pages_say_in_sentences_is_in_the_rows():

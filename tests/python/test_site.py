@@ -72,6 +72,36 @@ def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
     assert not refused
 
 
+# Words of each page (`wc -w`) that its reader can be asked to read. A page that needs more takes them from another.
+WORDS = {
+    "README.md": 1200, "CHANGELOG.md": 50, "CONTRIBUTING.md": 160, "DEVELOPING.md": 3050, "benchmarks/NOTES.md": 3450,
+    "benchmarks/README.md": 1000, "benchmarks/RESULTS.md": 2000, "benchmarks/harness/report/table.md": 80,
+    "benchmarks/timing/README.md": 380, "docs/cpp.md": 850, "docs/cuda.md": 1350, "docs/distributed.md": 900,
+    "docs/install.md": 850, "docs/look.md": 650, "docs/method.md": 1500, "docs/paper.md": 1300, "docs/scenes.md": 650,
+    "docs/settings.md": 1850, "docs/simplify.md": 530, "docs/site/python.md": 110, "docs/start.md": 350,
+    "docs/tools.md": 450, "docs/trainer.md": 1350, "docs/trainers.md": 630, "docs/usage.md": 1450,
+    "examples/README.md": 180, "examples/libtorch/README.md": 200, "integrations/README.md": 1180,
+    "patches/README.md": 1200}
+ALL_WORDS = 30200  # of all pages together; the sum of WORDS is what they come down to
+
+
+def test_the_pages_together_stay_short(stage):
+    pages = {str(page.relative_to(ROOT)): len(page.read_text(encoding="utf-8").split())
+             for page in stage.markdown_files()}
+    assert set(pages) == set(WORDS), "each page has its number of words"
+    most = max(pages, key=lambda page: pages[page] - WORDS[page])
+    assert sum(pages.values()) <= ALL_WORDS, (
+        f"{sum(pages.values())} words, and {ALL_WORDS} are allowed; {most} has grown most: {pages[most]} words, and "
+        f"{WORDS[most]} are meant")
+
+
+def test_the_site_shows_every_page_of_docs():
+    shown = re.findall(r": (\S+\.md)$", (ROOT / "docs" / "site" / "mkdocs.yml").read_text(encoding="utf-8"),
+                       re.MULTILINE)
+    assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= set(shown)
+    assert len(shown) == len(set(shown))
+
+
 def settings_tables():
     """The rows of docs/settings.md by heading: {heading: [(names, defaults, range)]}."""
     tables, heading = {}, ""
@@ -157,7 +187,7 @@ def test_the_page_of_settings_says_what_the_code_does(stage):
 
 def test_the_words_of_the_kernels_name_what_the_code_has(stage):
     words = (ROOT / "docs" / "cuda.md").read_text(encoding="utf-8").partition("## Words")[2].partition("\n## ")[0]
-    assert [line.split(" | ")[0][2:] for line in words.splitlines() if line.startswith("| ")][1:] == (
+    assert re.findall(r"^- \*\*(\w+)\*\*:", words, re.MULTILINE) == (
         "pair strong tail near faint covered wide footprint instance entry square quarter mark segment "
         "capacity").split()
     code = "\n".join(path.read_text(encoding="utf-8") for folder in (stage.INCLUDE, stage.INCLUDE.parents[1] / "csrc")

@@ -106,7 +106,7 @@ class Group:
         return over([self], name, lambda figures: figures[0])
 
     def measured_or_failed(self, names: Sequence[str]) -> List[Cell]:
-        """Those of several figures; if no seed has any, PSNR's place says so."""
+        """The cells of several figures; if no seed has any, the place of PSNR says so."""
         failed = bool(self.failed and not self.rows)
         return [Cell(text="failed") if failed and name == "psnr" else self.measured(name) for name in names]
 
@@ -116,7 +116,7 @@ class Group:
 
 
 def figures_of(row: Row) -> Dict[str, float]:
-    """What was measured of a row that is ok, by name. Times of a cell that shared its machine are left out."""
+    """The figures of a row that is ok, by name. Times of a cell that shared its machine are left out."""
     size = row.get("size_bytes") or {}
     millions = {"num_gaussians_m": row.get("num_gaussians"), "size_own_mb": size.get("own"),
                 "size_common_mb": size.get("common")}
@@ -175,7 +175,7 @@ def safe_name(name: str) -> str:
 
 def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], float],
          seeds: Optional[Set[int]] = None) -> Cell:
-    """Mean and spread of combine([the figure of each group]) over the seeds, of these, that all groups have it of.
+    """Mean and spread of combine([the figure of each group]), over the seeds for which all groups have it.
 
     What combine gives as NaN is left out. Times are of one machine, or there are none.
     """

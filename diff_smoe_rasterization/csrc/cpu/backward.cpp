@@ -24,7 +24,7 @@ template <class S> void add_records(const S* records, int64_t count, int size, d
   }
 }
 
-// What the tiles say of each Gaussian. If means2D_abs is wanted, records end with its sums.
+// The tiles' contributions to each Gaussian's gradient. If means2D_abs is wanted, records end with its sums.
 template <class S> struct Records {
   int size;                           // numbers a record
   std::unique_ptr<S[]> of_instances;  // one for each instance, a Gaussian's side by side
@@ -78,8 +78,8 @@ template <class S> class RecordSums {
   RecordSums(const Frame<S>& frame, const Records<S>& records, S* means2D_abs)
       : frame_(frame), records_(records), means2D_abs_(means2D_abs), sum_(records.size), wide_(records.size) {}
 
-  // Fills `sums`, which last until the next call, with those of Gaussian i, and stores its absolute ones if they are
-  // wanted. Returns false if it has no instances.
+  // Points `sums` at the sums of Gaussian i, which last until the next call, and stores its absolute sums if wanted.
+  // Returns false if it has no instances.
   bool operator()(int64_t i, PixelSums<S>& sums) {
     const SavedForward<S>& saved = frame_.saved;
     const int size = records_.size;

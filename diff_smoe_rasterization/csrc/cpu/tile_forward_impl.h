@@ -9,8 +9,8 @@ namespace dsmoe {
 namespace cpu {
 namespace DSMOE_SIMD {
 
-// Draws a tile. Its list is taken in batches. For each batch and each pack of pixels, the alphas of the Gaussians that
-// meet the pack's cell come first, those of smooth cells apart. Then the pack blends them in order, with its sums in
+// Draws a tile, its list in batches. For each batch and pack of pixels it first computes the alphas of the Gaussians
+// that meet the pack's cell, by a loop of its own if the cell is smooth. Then it blends them in order, with the sums in
 // registers.
 template <class S, BlendMode kMode, int kFeatures> class TilePainter {
  public:
@@ -124,7 +124,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
 
   using EntryBits = uint32_t;                           // one bit a Gaussian of the batch, the first one's the lowest
   static constexpr int kBatch = 8 * sizeof(EntryBits);  // Gaussians: they stay in the first cache
-  static constexpr int kTestEvery = 4;                  // pairs, for whether a pack is full; a full one changes no more
+  static constexpr int kTestEvery = 4;                  // pairs between two tests of whether a pack is full
 
   DSMOE_HD static EntryBits entries_of(const CellBits* cells, int cell) {
     EntryBits out = 0;
@@ -202,8 +202,8 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   CellBits open_;              // cells that take further pairs
   ListedGaussian<S> batch_[kBatch];
   alignas(64) CellBits met_[kBatch], smooth_[kBatch];  // of the batch
-  alignas(64) S alphas_[kBatch][P::kLanes];            // of a pack of pixels; if the pair does not count 0, or
-                                                       // less by what it is as a tail
+  alignas(64) S alphas_[kBatch][P::kLanes];            // of a pack of pixels; 0 if the pair does not count; a tail's
+                                                       // alpha is stored negated
 };
 
 template <class S, BlendMode kMode, int kFeatures>

@@ -15,8 +15,8 @@ namespace DSMOE_SIMD {
 
 template <class S> using Pack = ::dsmoe::DSMOE_SIMD::Pack<S>;
 
-// A tile is made of square cells, row by row. A cell is the largest pack's pixels, row by row; smaller packs take a
-// part of it each. A square is met by fewer Gaussians than a row of as many pixels.
+// A tile is made of square cells, row by row. A cell has as many pixels as the largest pack; smaller packs take a part
+// of it each. Cells are square because fewer Gaussians meet a square than a row of as many pixels.
 constexpr int kCellSize = 4;  // pixels
 constexpr int kCellPixels = kCellSize * kCellSize;
 constexpr int kCellColumns = kTileSize / kCellSize;
@@ -108,7 +108,7 @@ template <class S> struct ListedGaussian {
   S position;     // in the list, from 0
   uint32_t slot;
   CellBits met;       // the cells that pairs of the walk lie in, or some more
-  CellBits smooth;    // those of them over which the Gaussian is smooth, and which have no faint pairs
+  CellBits smooth;    // of these, the cells over which the Gaussian is smooth and which have no faint pairs
   const S* features;  // [F]
 
   // Of smooth cells: alpha at the centre, and its factors at the pixels, by the cell's column and by its row.
@@ -247,7 +247,7 @@ template <BlendMode kMode, class S> class WidePixels {
 
   DSMOE_HD Pairs wanted() const { return any_ ? Pairs::kWide : Pairs::kNarrow; }
 
-  // Takes the faint pairs of covered pixels from a pack of a wide walk. at: of the first pixel.
+  // Removes the faint pairs of covered pixels from a pack of a wide walk. at: of the first pixel.
   DSMOE_HD void cut(Gate<P>& gate, const ListedGaussian<S>& gaussian, int at) const {
     if (!Blend<kMode>::kNearFirst || !any_) return;
     gate.counts = gate.counts & (gate.logit >= covered_.load(at) * P(gaussian.near_alpha));

@@ -18,7 +18,7 @@ template <class S, int kSums, int kPixels> struct BlendedPixels {
   bool wide[kPixels];      // the pixel is: known behind the narrow walk
 };
 
-// Notes the state of the pixels where a segment begins; in a wide walk that of the wide pixels, if `kept`.
+// Saves the state of the pixels where a segment begins; in a wide walk only of wide pixels, if `kept`.
 template <class S, int kSums, int kPixels>
 __device__ void note_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
                              const BlendedPixels<S, kSums, kPixels>& pixels, bool kept) {

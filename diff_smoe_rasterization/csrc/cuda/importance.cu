@@ -75,11 +75,11 @@ template <class S, int kChannels> struct WeighedPixels {
   S weight[kLanePixels], share_weight[kLanePixels];  // in the caller's maps
   S alone[kLanePixels];                              // |bg - C|^2
   int32_t last[kLanePixels];                         // entries of the list that the numerator has seen
-  bool wide[kLanePixels];                            // the pixel is
+  bool wide[kLanePixels];                            // whether the pixel is wide
 };
 
-// The numbers of one Gaussian in shared memory, by lane. Four lanes sum a row. Between its rows lie some numbers, so
-// that lanes of eight rows read from different banks.
+// The numbers of one Gaussian in shared memory, by lane. Four lanes sum a row. Rows are padded, so that lanes of eight
+// rows read from different banks.
 template <class S> struct ImportanceRow {
   alignas(16) S numbers[Importance<S>::kNum][kWarp];
   S apart[16 / sizeof(S)];

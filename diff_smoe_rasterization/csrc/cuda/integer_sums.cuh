@@ -101,7 +101,7 @@ template <class S> struct SumBounds {
   const int32_t* radii;          // [N] pixels; 0: the other arrays hold nothing for this Gaussian
   ImageGradients<S> dL_dimages;  // any may be null
   int32_t* gradients;            // [F + 1] exponents of the largest dL/dfeature and dL/dgate_sum
-  int32_t* features;             // [feature_stride(F)] of the largest features; both are below every exponent before
+  int32_t* features;             // [feature_stride(F)] those of the largest features; both start below every exponent
 };
 
 // Each row of blocks goes through one image of gradients.
@@ -183,7 +183,7 @@ __global__ void __launch_bounds__(kStoreBlock)
       sums.exponents[number] = gradient(number - kNumGateMoments) + 1;  // w may exceed D by its rounding
       continue;
     }
-    int most = gradient(num_features) + has_tails(config.blend.mode);  // whose alpha image is like a feature of 1
+    int most = gradient(num_features) + has_tails(config.blend.mode);  // its alpha image is like a feature of 1
     for (int f = 0; f < num_features; ++f) {
       const S background = abs(feature_background(config, f));
       int feature = max(kNoExponent, bounds.features[f]);
@@ -211,7 +211,7 @@ __global__ void __launch_bounds__(kStoreBlock)
   arguments.records[at] = arguments.sums.sum(gaussian, static_cast<int>(at % arguments.sums.length));
 }
 
-// Empty sums, with their units.
+// Zeroes the sums and finds their units.
 template <class S>
 IntegerSums<S> begin_integer_sums(const Frame<S>& frame, const Gradients<S>& gradients, const Work& work) {
   constexpr unsigned kBlocks = 512;  // a few for each multiprocessor: each ends with atomics to the same numbers

@@ -17,7 +17,7 @@ constexpr int kWarps = kAdamBlock / kWarp;
 constexpr int kRowLanes = 16;
 constexpr int kRowNumbers = 3;
 
-// Missed steps that are interleaved: a step's root and reciprocal do not wait for those of the step before.
+// Missed steps that are interleaved: a step's root and reciprocal do not wait for the step before.
 constexpr int kStepUnroll = 4;
 
 // Blocks that one multiprocessor holds at once: of floats, so many that enough loads are in flight.

@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kListBlock)
   int64_t slot = static_cast<int64_t>(shared_before + before);
 #pragma unroll 1
   for (int r = 0; r < kListedPerLane; ++r) {
-    // Registers are not arrays to a loop that is not unrolled.
+    // Unrolled, because registers cannot be indexed at run time.
     int32_t gaussian = gaussians[0];
     MacroRect rect = rects[0];
 #pragma unroll
@@ -292,7 +292,7 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
     const uint64_t tiles = tiles_of(exists ? arguments.listed[entry] : 0);
     const int32_t gaussian = exists ? arguments.gaussians[entry] : 0;
 
-    // Where this chunk's instances of each tile begin: behind those of the macro tile's earlier chunks.
+    // Where this chunk's instances of each tile begin: behind the macro tile's earlier chunks.
     __syncthreads();  // wait until all reads of the previous chunk are done
     if (threadIdx.x < kTilesPerMacro) {
       const int x = chunk.macro % arguments.macro_columns * kMacroTiles + threadIdx.x % kMacroTiles;

@@ -21,8 +21,8 @@ unsigned resident_blocks(int64_t pieces) {
   return static_cast<unsigned>(min(pieces, int64_t(kResidentBlocks) * num_multiprocessors()));
 }
 
-// What a call works in, and what its kernels have in common. `capacity` is for each kind of list. Seldom are those of
-// macro tiles longer, by macro tiles that long Gaussians only pass by.
+// The memory of a call. `capacity` is the room of each kind of list. Macro tiles seldom have the longer lists: only
+// where many Gaussians meet a macro tile by their bounding box and not by their ellipse.
 template <class Key> struct Room {
   template <class S>
   Room(const Frame<S>& frame, const Work& work)
@@ -55,7 +55,7 @@ template <class Key> struct Room {
   const int64_t num_tiles, capacity, list_blocks, offset_blocks;
   int passes = 1;          // of the sort
   int64_t groups_of_pass;  // their numbers
-  // Zero, in one piece: the states of the look-backs, each with its counter behind, and the counts.
+  // Zeroed, in one piece: the states of the look-backs, each followed by its counter, and the counts.
   unsigned long long *list_states, *offset_states;
   uint32_t *groups, *tile_counts, *longer;
   int64_t* num_entries;  // [1] written by the first kernel

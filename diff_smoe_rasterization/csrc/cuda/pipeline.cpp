@@ -93,7 +93,7 @@ void draw(Frame<S>& frame, SavedSizes sizes, const DepthBits<S>* depths, const R
   memory.release();
 }
 
-// Memory for the records, zeros, or those of the caller.
+// The caller's records, or zeroed memory for them.
 template <class S> S* begin_records(const Frame<S>& frame, S* given, const Run& run, Allocator& memory) {
   const int64_t size = frame.inputs.num_gaussians * (kNumGateMoments + frame.config.num_features());
   if (given == nullptr) return allocate_zeros<S>(memory, size, run.stream);

@@ -3,8 +3,8 @@
 // takes. (Taming 3DGS, arXiv:2406.15643, notes such states every 32 Gaussians, and gives those to a warp.)
 //
 // Segment s of a tile holds entries [s L, (s + 1) L) of its list, where L is kSegmentLength. A tile's first segment
-// needs no state. That of another one lies in row floor(begin / L) + s, with `begin` the tile's first instance. No two
-// segments share a row: a tile's last row is at most floor(end / L), and the next tile's first row is above that.
+// needs no state. The state of any other lies in row floor(begin / L) + s, with `begin` the tile's first instance. No
+// two segments share a row: a tile's last row is at most floor(end / L), and the next tile's first row is above that.
 #pragma once
 
 #include "tile_walk.cuh"
@@ -17,7 +17,7 @@ static_assert(kSegmentLength % kWarp == 0, "a segment is a number of whole chunk
 // The state of one pixel where a segment begins.
 template <class S> struct alignas(4 * sizeof(S)) SegmentPixel {
   S transmittance;        // in front of the segment
-  S sums[kFastFeatures];  // sum w c from there to the list's end; up to there, as long as the end is not reached
+  S sums[kFastFeatures];  // sum w c behind there; until the walk has reached the list's end, sum w c in front of it
 };
 
 // The state of the lane's pixel k in segment 1, 2, ... of its tile.
@@ -53,8 +53,8 @@ struct WarpSegment {
   int tile, quarter, segment;
 };
 
-// The first blocks take the queue, an entry a warp, for nearly all of its segments are whole. Those behind take the
-// first segment of one tile each, the longest lists first.
+// The first blocks take the queue, one entry a warp, because nearly all of its segments are full. The later blocks take
+// the first segment of one tile each, the longest lists first.
 template <class S> __device__ int queue_blocks(const SavedForward<S>& saved) {
   return saved.segments != nullptr ? (segment_queue(saved).entries[0].x + kWarpsPerTile - 1) / kWarpsPerTile : 0;
 }

@@ -33,7 +33,7 @@ template <class S> struct BlendArguments {
   SavedForward<S> saved;      // what the forward pass leaves, and reads itself
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
   bool marked;                // entries of lists are marked with quarters
-  bool near_first;            // marks are by near pairs, and so are walks that are not wide
+  bool near_first;            // marks, and walks that are not wide, are only of near pairs
   S wide_below, tail_alpha;   // of BlendRules
   S tail_reach;               // of BlendRules
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
@@ -77,8 +77,8 @@ template <class S> class EntrySource {
   // Stands for an entry, and meets no pixels.
   __device__ uint32_t no_entry() const { return marked ? (1u << kMarkShift) - 1 : kSign; }
 
-  // Whether an entry may meet the quarter's pixels. Never for a culled Gaussian, which only the depth order has. kWide:
-  // by more pairs than those of the marks.
+  // Whether an entry may meet the quarter's pixels. False for a culled Gaussian, which only the depth order has. kWide:
+  // also by pairs that the marks leave out.
   template <bool kWide> __device__ bool may_meet(uint32_t entry) const {
     if (kWide && marked) return entry != no_entry();
     return ((marked ? entry : ~entry) & wanted_) != 0;
@@ -96,7 +96,7 @@ template <class S> class EntrySource {
   static constexpr uint32_t kSign = 1u << 31;
 
   const int32_t* entries_;  // [length]
-  uint32_t wanted_;         // the bit of an entry that tells
+  uint32_t wanted_;         // the bit that decides: the quarter's mark, or the sign
 };
 
 // The square of pixels of a warp, or of two that share it, and the entries that may meet them.
@@ -159,7 +159,7 @@ template <class S, bool kWithFeatures> struct Stage {
 };
 template <class S, class Visitor> using WarpStage = Stage<S, Visitor::kReadsFeatures>;
 
-// The vertical distance of the lane's pixel k, from that of its first one.
+// The vertical distance of the lane's pixel k; dy: of its first pixel.
 template <class S> __device__ __forceinline__ S below(S dy, int k) { return k == 0 ? dy : dy + S(k * kLaneStep); }
 
 // The part of a list that a warp walks.
@@ -350,7 +350,7 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
   return met;
 }
 
-// Adds the pairs of the entries that a warp has met to the count of the rendering. pixels: that the warp walked for.
+// Adds the pairs that a warp evaluated to the rendering's count. pixels: for how many the warp walked.
 template <class S>
 __device__ void count_pairs(const BlendArguments<S>& arguments, int lane, unsigned met,
                             int pixels = kWarpTile * kWarpTile) {

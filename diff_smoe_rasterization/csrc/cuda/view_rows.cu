@@ -189,7 +189,7 @@ __global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_c
     if (row < 0) continue;
     auto [radius_again, projected] = project(lane.gaussian, shared.cameras[v], lane.config.projection_rules());
     float features[kFastFeatures] = {};
-    // Rounding may differ from that of the kernel that counted: then the Gaussian is culled only here.
+    // The kernel that counted may have rounded otherwise: then the Gaussian is culled only here.
     if (radius_again == 0 || !write_features<float>(lane.source(shared.cameras[v]), projected.depth, features)) {
       radius = 0, projected = {};
       features[0] = features[1] = features[2] = 0;

@@ -2,8 +2,8 @@
 // `background_gate` and `kDivides` say how the sums become a pixel (pixel.h). `backward` takes the pairs back to front.
 // A policy also carries every fact of its mode. All other code asks the policy, or iterates BlendModes.
 //
-// With alpha_i the gate logit, T_i = prod_{j<i} (1 - alpha_j) (Eq. 4), c_i the expert, w_i = alpha_i T_i, W = sum w_i
-// and T what is left behind the last pair:
+// With alpha_i = min(0.99, o_i G_i) (the paper's gate logit), T_i = prod_{j<i} (1 - alpha_j) (Eq. 4), the expert c_i,
+// w_i = alpha_i T_i, W = sum w_i, and T behind the last pair:
 //
 //   alpha     Eq. 3   C = sum c_i w_i + T bg
 //   smoe              C = (sum c_i w_i + B bg) / (W + B)

@@ -1,5 +1,5 @@
 // One (Gaussian, pixel) pair: the projected kernel G (Eq. 1, 2), the gate alpha = min(0.99, o G), whether the pair
-// counts, and the derivatives by all that the pair was made of.
+// counts, and the derivatives by its inputs.
 #pragma once
 
 #include "dsmoe/constants.h"
@@ -47,7 +47,7 @@ template <class S> struct AlphaCut {
   DSMOE_HD S of(S opacity) const { return max(alpha_min, min(faint, opacity * S(kCoreKernel))); }
 };
 
-// The squared reach k^2 of a Gaussian that no pixel sees: no further reach that is added to it makes it 0.
+// The squared reach k^2 of a Gaussian that no pixel sees: still negative when a tail's reach is added.
 constexpr float kNoReach = -1e30f;
 
 // The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. If it is negative
@@ -127,7 +127,7 @@ template <class S> struct LogGate {
 
   template <class Real> DSMOE_HD ColumnExponent<Real, S> column(Real dx) const { return {factors, dx, greatest}; }
 
-  // As near_alpha. It is the same number again if `least` is that of a near pair.
+  // As near_alpha. Unchanged if `least` is a near pair's already.
   DSMOE_HD S near_least() const {
     return max(least, min(S(kLog2AlphaCut), max(S(kLog2CoreAlpha), greatest + S(kLog2CoreKernel))));
   }

@@ -92,7 +92,7 @@ TEST(JsonViews, RefuseWithPlaceAndReason) {
   expect_refused(kInria, "[5, 6, 7]", "[5, 6]", ": camera 0: `position`", "3 numbers");
   expect_refused(kInria, "[5, 6, 7]", "7", ": camera 0: `position`", "3 numbers");
   expect_refused(kInria, "[0, 0, -1]", "[0, 0, 1]", ": camera 0: `rotation`", "mirrors");
-  expect_refused(kInria, "[0, 0, -1]", "[0, 0, 0]", ": camera 0: `rotation`", "no rotation");
+  expect_refused(kInria, "[0, 0, -1]", "[0, 0, 0]", ": camera 0: `rotation`", "not a rotation");
   expect_refused(kInria, "\"img_name\"", "\"name\"", ": camera 0", "`img_name` is missing");
   expect_refused(kTransforms, "\"k1\": 0", "\"k1\": 0.1", ": `k1`", "distortion");
   expect_refused(kTransforms, "\"frames\"", "\"views\"", "", "`frames` is missing");

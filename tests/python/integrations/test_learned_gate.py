@@ -26,6 +26,7 @@ HAS_HOOKS = learned_gate._HAS_HOOKS
 @pytest.fixture(autouse=True)
 def a_gate_of_its_own(monkeypatch):
     monkeypatch.setattr(settings, "blend_of_process", None)
+    records._models_read.clear()
     gate.reset()
     yield
     gate.reset()
@@ -369,6 +370,7 @@ def process(monkeypatch):
     """Makes this a process that blends so, as `dsmoe run` does."""
     def blends(mode, background_gate="learned"):
         gate.reset()
+        records._models_read.clear()
         records._told.clear()
         monkeypatch.setenv("DSMOE_BLEND_MODE", mode)
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", str(background_gate))
@@ -539,6 +541,36 @@ def test_a_model_of_another_blend_is_named(kind, own, record, said, tmp_path, pr
     told = capfd.readouterr().err
     assert said in told and told.count("\n") == bool(said)
     assert own[1] != "learned" or gate.value() == (0.3 if record[0] == "smoe" else 0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("blend", [("smoe", "learned"), ("", "")], ids=["smoe", "no blend chosen"])
+@pytest.mark.parametrize("gates", [(0.192, 0.180), (0.3, 0.3)], ids=str)
+def test_a_process_that_merges_models_records_what_they_record(kind, blend, gates, tmp_path, process, capfd):
+    """It renders none: VastGaussian's blocks become one model. What cannot be kept is said."""
+    process("alpha")
+    paths = [tmp_path / (name + kind) for name in ("a", "b", "merged")]
+    for path, value in zip(paths, gates):
+        if kind != ".ply":
+            KINDS[kind][0](path)
+        with_record(kind, path, {"blend_mode": "smoe", "background_gate": value})
+    process(*blend)
+    for path in paths[:2]:
+        KINDS[kind][1](path)
+    KINDS[kind][0](paths[2])
+    told = capfd.readouterr().err
+    said = "a{0}: smoe, background gate 0.192; .*b{0}: smoe, background gate 0.18.*it records the last"
+    assert bool(re.search("models that it has read differ .*" + said.format(kind), told)) == (gates[0] != gates[1])
+    process("smoe")
+    KINDS[kind][1](paths[2])
+    assert gate.value() == gates[1]
+    process(*blend)
+    KINDS[kind][1](paths[0])
+    view, gaussians = scene()
+    with torch.no_grad():  # one that renders says how
+        image(view._replace(blend_mode="smoe_tn", background_gate=None), gaussians)
+    KINDS[kind][0](paths[2])
+    assert (b"0.192" in paths[2].read_bytes()) is False
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -45,8 +45,7 @@ def test_presets_have_defaults():
     fast = {"strategy": "importance", "strategy_options": "overshoot=1.5,removals=4"}
     assert with_preset({}, "fast", "cuda") == {**fast, "iterations": 7000, "densify_until_iter": 2450}
     assert with_preset({}, "fast", "cpu") == {**fast, "iterations": 3000, "densify_until_iter": 1050}
-    best = {"strategy": "importance", "iterations": 60_000, "densify_until_iter": 30_000,
-            "strategy_options": "views=255"}
+    best = {"strategy": "importance", "iterations": 60_000, "strategy_options": "views=255"}
     assert with_preset({}, "best", "cuda") == {**best, "scaling_lr": 0.02}
     assert with_preset({"scaling_lr": 0.01}, "best", "cpu") == {**best, "scaling_lr": 0.01}
 

@@ -730,7 +730,7 @@ def test_processes_do_not_share_an_unfinished_file_and_what_a_killed_one_left_go
 
 
 @pytest.mark.parametrize("what, make", [
-    ("a link", lambda path: os.symlink("precious", path)), ("no regular file", os.mkfifo), ("a folder", os.mkdir)])
+    ("a link", lambda path: os.symlink("precious", path)), ("not a regular file", os.mkfifo), ("a folder", os.mkdir)])
 def test_what_is_no_regular_file_is_never_replaced(tmp_path, what, make):
     path = str(tmp_path / "file")
     make(path)
