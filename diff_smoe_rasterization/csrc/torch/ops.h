@@ -439,7 +439,7 @@ template <class Backend> void gate_map(Arguments& arguments) {
   arguments.give_back(gaussians, counts, medians);
 }
 
-// The arguments of an op on a batch of views: those of its first view, and all cameras.
+// The arguments of an op on a batch of views: its first view's, and all cameras.
 struct BatchArguments {
   explicit BatchArguments(Arguments& arguments)
       : inputs(read_inputs(arguments)),
