@@ -312,7 +312,7 @@ template <class Backend> void project_backward(Arguments& arguments) {
   arguments.give_back(std::move(results));
 }
 
-// The arguments of an op on a batch of views: those of its first view, and all cameras.
+// The arguments of an op on a batch of views: its first view's, and all cameras.
 struct BatchArguments {
   explicit BatchArguments(Arguments& arguments)
       : inputs(read_inputs(arguments)),
