@@ -177,7 +177,7 @@ template <class Frame> void refuse_radii(const char* function, const Frame& fram
   refuse_null(function, "images.radii", frame.images.radii, "[N]", frame.inputs.num_gaussians);
 }
 
-// A batch of views that is not as its struct says. Frame: that of the backend. refuse_view(view): refuses what a stage
+// A batch of views that is not as its struct says. Frame: the backend's. refuse_view(view): refuses what a stage
 // cannot read or write of a view.
 template <class Frame, class Batch, class Refuse>
 void refuse_batch(const char* function, const Batch& batch, const Refuse& refuse_view) {

@@ -11,7 +11,7 @@
 namespace dsmoe {
 namespace binding {
 
-// The arguments of an op on a batch of views: those of its first view, and all cameras.
+// The arguments of an op on a batch of views: its first view's, and all cameras.
 struct BatchArguments {
   explicit BatchArguments(Arguments& arguments)
       : inputs(read_inputs(arguments)),

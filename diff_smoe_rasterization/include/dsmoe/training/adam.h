@@ -158,7 +158,7 @@ template <class S> struct LazyAdamStep {
   int64_t num_rows;      // N
   int32_t* marks;        // [N] written where radii is above 0; these rows are up to date
   const int32_t* radii;  // [N] above 0 in rows that have a gradient
-  AdamRates<S>* rates;   // [steps + 1, num_tensors] of each step; those of this one are written
+  AdamRates<S>* rates;   // [steps + 1, num_tensors] of each step; this step's are written
   AdamRates<S> new_rates[kLazyAdamMaxTensors];
   int num_tensors;
   int32_t steps;                    // made before this one

@@ -8,7 +8,7 @@
 
 namespace dsmoe {
 
-// From the numbers that an optimizer moves freely to those of a Gaussian: opacity = sigmoid(logit), scale = exp(log),
+// From the numbers that an optimizer moves freely to a Gaussian's: opacity = sigmoid(logit), scale = exp(log),
 // rotation = quaternion / |quaternion|. Each backward function returns dL/dinput from the output and dL/doutput.
 
 template <class S> DSMOE_HD S sigmoid(S logit) { return S(1) / (S(1) + exp(-logit)); }
@@ -201,7 +201,7 @@ template <class S> struct GaussianAdam {
   ActivatedTensor<S> tensors[kGaussianAdamTensors];
   int64_t num_gaussians;            // N
   const int32_t* radii;             // [N] above 0 if a Gaussian was seen; the others have no gradient
-  const AdamRates<S>* given_rates;  // [kGaussianAdamTensors] in place of those of the tensors, or null
+  const AdamRates<S>* given_rates;  // [kGaussianAdamTensors] in place of the tensors', or null
   AdamConstants<S> constants;
 
   // Of tensor t.
