@@ -354,7 +354,7 @@ def _render(arguments: argparse.Namespace) -> None:
 
 def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outputs: List[str]) -> None:
     from .filming import film
-    from .opening import open_trained
+    from .inspection import open_trained
 
     trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                            **overrides)
