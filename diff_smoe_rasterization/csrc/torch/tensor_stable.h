@@ -26,6 +26,7 @@
 #define DSMOE_CHECK_NOT_IMPLEMENTED(...) DSMOE_RAISE_UNLESS(ErrorKind::kNotImplemented, __VA_ARGS__)
 
 #define DSMOE_LIBRARY(m) STABLE_TORCH_LIBRARY(diff_smoe_rasterization, m)
+#define DSMOE_LIBRARY_FRAGMENT(m) STABLE_TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m)
 #define DSMOE_LIBRARY_IMPL(key, m) STABLE_TORCH_LIBRARY_IMPL(diff_smoe_rasterization, key, m)
 
 namespace dsmoe {

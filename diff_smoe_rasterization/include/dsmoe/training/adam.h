@@ -94,6 +94,10 @@ template <class S> struct AdamStep {
   const bool* visible;  // [rows] which rows of every tensor are stepped, or null: all are
 };
 
+// What both backends refuse: null pointers, by name, and sizes that would have them read elsewhere. Throws
+// std::invalid_argument.
+template <class S> void refuse_adam(const char* function, const std::vector<AdamTensor<S>>& tensors);
+
 namespace cpu {
 
 // Steps the parameters and their moments in place. All pointers are to memory of the host.
@@ -164,6 +168,10 @@ template <class S> struct LazyAdamStep {
   DSMOE_HD int32_t num_steps() const { return given_steps != nullptr ? static_cast<int32_t>(*given_steps) : steps; }
   DSMOE_HD AdamRates<S> new_rate(int t) const { return given_rates != nullptr ? given_rates[t] : new_rates[t]; }
 };
+
+// As refuse_adam.
+template <class S> void refuse_catch_up(const char* function, const LazyAdam<S>& adam);
+template <class S> void refuse_note_step(const char* function, const LazyAdamStep<S>& step);
 
 namespace cpu {
 

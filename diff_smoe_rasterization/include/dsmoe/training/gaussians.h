@@ -233,6 +233,8 @@ DSMOE_HD void step_quaternion(const AdamConstants<S>& constants, const AdamRates
   normalize_quaternion(n.raw, n.value);
 }
 
+template <class S> void refuse_step_gaussians(const char* function, const GaussianAdam<S>& adam);  // as refuse_adam
+
 namespace cpu {
 
 template <class S> void step_gaussians(const GaussianAdam<S>& adam, int num_threads);
