@@ -204,7 +204,7 @@ def said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
     model = os.stat(ply)
     return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on "
             f"{os.path.abspath(config.scene)}: {renderer.blend_mode} {renderer.background_gate}, resolution "
-            f"{config.resolution}, principal point {config.principal_point}, "
+            f"{config.resolution}, principal point {config.principal_point}, lenses {config.lenses}, "
             f"{'white' if config.white_background else 'black'} background")
 
 
