@@ -82,7 +82,7 @@ WORDS = {
     "docs/tools.md": 450, "docs/trainer.md": 1240, "docs/trainers.md": 610, "docs/usage.md": 1500,
     "examples/README.md": 210, "examples/libtorch/README.md": 200, "integrations/README.md": 1030,
     "patches/README.md": 1200}
-ALL_WORDS = 28800  # of all pages together; the sum of WORDS is what they come down to
+ALL_WORDS = 28500  # of all pages together; WORDS sums to it
 
 
 def test_the_pages_together_stay_short(stage):
