@@ -1,7 +1,7 @@
 // The op of the sums over the pixels of each Gaussian.
 #pragma once
 
-#include "torch/op.h"
+#include "torch/backend.h"
 
 namespace dsmoe {
 namespace binding {
@@ -25,8 +25,11 @@ template <class Backend> void contributions(Arguments& arguments) {
     sums.pixels = mutable_data<int32_t>(pixels);
     sums.blend_weights = mutable_data<S>(blend_weights);
     sums.distances = mutable_data<S>(distances);
-    Backend::template contributions<S>(expect, map, radii, saved, blend_config<S>(background_gate, options), options,
-                                       sums);
+    const auto own =
+        Backend::template walked<S>(expect, radii, saved, blend_config<S>(background_gate, options), options);
+    const ContributionMap<S> arguments = {data<S>(map), sums};
+    TensorMemory memory(map);
+    Backend::contributions(own, arguments, Call{options, memory, nullptr});
   });
   arguments.give_back(weights, pixels, blend_weights, distances);
 }

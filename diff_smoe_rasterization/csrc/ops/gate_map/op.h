@@ -1,7 +1,7 @@
 // The op of the Gaussians that have a part in each pixel.
 #pragma once
 
-#include "torch/op.h"
+#include "torch/backend.h"
 
 namespace dsmoe {
 namespace binding {
@@ -22,8 +22,10 @@ template <class Backend> void gate_map(Arguments& arguments) {
     using S = decltype(zero);
     const GateMap map = {mutable_data<int32_t>(gaussians), mutable_data<int32_t>(counts),
                          mutable_data<int32_t>(medians)};
-    Backend::template gate_map<S>(expect, gate_sum, radii, saved, blend_config<S>(background_gate, options), options,
-                                  map);
+    auto own = Backend::template walked<S>(expect, radii, saved, blend_config<S>(background_gate, options), options);
+    set_sums(own.saved, Backend::saved_sizes(own, options), mutable_data<S>(gate_sum));
+    TensorMemory memory(radii);
+    Backend::gate_map(own, map, Call{options, memory, nullptr});
   });
   arguments.give_back(gaussians, counts, medians);
 }

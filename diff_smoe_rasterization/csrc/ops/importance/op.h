@@ -1,7 +1,7 @@
 // The op of what each Gaussian is worth to an image.
 #pragma once
 
-#include "torch/op.h"
+#include "torch/backend.h"
 
 namespace dsmoe {
 namespace binding {
@@ -39,7 +39,10 @@ template <class Backend> void importance(Arguments& arguments) {
     map.sums.shares = mutable_data<S>(shares);
     map.sums.squared_shares = mutable_data<S>(squared_shares);
     map.sums.removal_costs = mutable_data<S>(removal_costs);
-    Backend::template importance<S>(expect, gate_sum, radii, saved, config, options, map);
+    auto own = Backend::template frame_of_rendering<S>(radii, config, options);
+    Backend::take_saved(own, expect, saved, mutable_data<S>(gate_sum), options);
+    TensorMemory memory(gate_sum);
+    Backend::importance(own, map, Call{options, memory, nullptr});
   });
   arguments.give_back(shares, squared_shares, removal_costs);
 }
