@@ -158,8 +158,8 @@ def _found_run(folder: str) -> Found:
 
 
 def _options_of_3dgs(folder: str) -> Dict[str, Any]:
-    """What cfg_args, a Namespace as text, says of the training; its loader moves principal points to the centre."""
-    options: Dict[str, Any] = {"principal_point": "centre"}
+    """What cfg_args, a Namespace as text, says of the training. Where it had principal points is seen later."""
+    options: Dict[str, Any] = {}
     path = os.path.join(folder, CFG_ARGS)
     if not is_file(path):
         return options

@@ -208,7 +208,7 @@ def test_a_model_folder_says_where_and_how_it_was_trained(run, tmp_path):
     found = find_model(folder)
     assert found.path == model_path(folder, 30)
     assert found.options == {"scene": run.scene, "images": "images", "resolution": 30, "white_background": False,
-                             "antialiasing": False, "principal_point": "centre", "test_every": 0}
+                             "antialiasing": False, "test_every": 0}
     row = simplify(folder, str(tmp_path / "out"), budget=40, **SHORT)
     assert row["protocol"]["scene_kind"] == "colmap" and row["psnr"] is None, "it had trained on all images"
 
@@ -232,6 +232,10 @@ def test_where_the_models_program_had_its_principal_points_is_seen(run, tmp_path
     assert main(["simplify", *words, "-o", str(tmp_path / "out"), "--resume"]) == 0
     assert main(["simplify", *words, "-o", str(tmp_path / "asked"), "--principal-point", "scene"]) == 0
     assert TrainConfig.load(str(tmp_path / "asked")).principal_point == "scene"
+    (tmp_path / "model").mkdir()
+    folder = model_folder(run, tmp_path / "model", f"Namespace(source_path={scene!r}, resolution=30, eval=True)")
+    assert simplify(folder, str(tmp_path / "3dgs"), budget=40, iterations=4, progress=False)["protocol"][
+        "principal_point"] == "centre"
     capsys.readouterr()
     assert main(["train", scene, "--init", ply_of(run), "-o", str(tmp_path / "init"), "--iterations", "2",
                  "--resolution", "30", "--quiet"]) == 0
