@@ -150,7 +150,7 @@ def _found_run(folder: str) -> Found:
         names += ["blend_mode", "background_gate"]
     photographs = is_folder(config.scene)
     if photographs:
-        names += ["scene", "images", "strict", "resolution", "principal_point"]
+        names += ["scene", "images", "strict", "resolution", "principal_point", "lenses"]
     options = {name: getattr(config, name) for name in names}
     if not photographs and is_file(os.path.join(folder, CAMERAS)):
         options.update(scene=folder, resolution=1)  # the cameras are those of the resized images

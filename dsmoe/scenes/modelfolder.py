@@ -19,6 +19,7 @@ from ..system.files import is_file
 from .cameras import Camera
 from .images import View, fitted_camera, size_of_image
 from .layout import Layout, PosedImage, hold_out
+from .lens import lens_named
 
 CAMERAS = "cameras.json"
 CFG_ARGS = "cfg_args"  # the options of its training
@@ -79,14 +80,17 @@ def _camera(entry: Any) -> Camera:
         raise ValueError(f"`rotation` of {entry['img_name']} is not a rotation")
     if not (min(numbers[:2]) > 0 and min(width, height) > 0):
         raise ValueError(f"`width`, `height`, `fx` and `fy` of {entry['img_name']} must be above 0")
-    return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width, height)
+    lens = lens_named(entry["camera_model"], entry.get("distortion", ())) if "camera_model" in entry else None
+    return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width, height, lens)
 
 
 def cameras_content(cameras: Sequence[Camera]) -> List[Dict[str, Any]]:
     """What `cameras.json` holds of cameras, for viewers of 3DGS and for `read_model_layout`."""
     return [{"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height,
              "position": camera.center.tolist(), "rotation": camera.rotation.T.tolist(), "fx": camera.fx,
-             "fy": camera.fy, "cx": camera.cx, "cy": camera.cy} for index, camera in enumerate(cameras)]
+             "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+             **({"camera_model": camera.lens.camera_model, "distortion": camera.lens.coefficients} if camera.lens
+                else {})} for index, camera in enumerate(cameras)]
 
 
 @torch.no_grad()
