@@ -70,6 +70,8 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     training = evaluate(renderer, scene.train, device, progress, psnr_alone, passes=1).metrics["psnr"]
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, training,
                      renderer.background_gate)
+    if earlier and "start" in earlier[0]:  # of `dsmoe simplify`
+        row["start"] = earlier[0]["start"]
     if split == "test" and not is_other and not opened.so_far:
         try:
             write_results(output, [row])
