@@ -26,7 +26,7 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
         R, t: [3, 3] and [3], world to view: x_view = R x_world + t, with x right, y down, z forward.
         width, height: of the image in pixels.
         bg: [C] background colour; black where it is None. The matrices are on its device.
-        dtype: of the matrices, by default that of bg, else float32.
+        dtype: of the matrices, by default bg's, else float32.
         camera_model, distortion: the lens, and its numbers, as CAMERA_MODELS has them.
         options: further fields of the settings, such as blend_mode.
     K, R and t are tensors, arrays or lists. The matrices have gradients with respect to R, t and, in the projection, K.

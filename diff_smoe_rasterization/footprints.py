@@ -177,7 +177,7 @@ def _spread(tensors: Sequence[torch.Tensor], present: Sequence[bool]) -> List[Op
 def _reach_moves(opacities: torch.Tensor, options: Dict[str, Any], gate: Optional[torch.Tensor]) -> torch.Tensor:
     """[N] bool: whether the squared reach is 2 log(opacity / least alpha) and the least alpha is constant.
 
-    Elsewhere the reach is constant. The rule is that of `squared_reach` and `AlphaCut` in include/dsmoe/gate.h.
+    Elsewhere the reach is constant. The rule is `squared_reach` and `AlphaCut` in include/dsmoe/gate.h.
     """
     positive, constants = opacities > 0, _core.constants
     if BLEND_MODES[options["blend_mode"]] in ("alpha", "smoe"):

@@ -182,7 +182,7 @@ def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, sub
     make_folder(folder)
     with only_one(folder), torch.no_grad():
         earlier = own_record(folder, RENDER, overwrite)
-        kept = earlier.files if subject == earlier.subject else []  # those of another split
+        kept = earlier.files if subject == earlier.subject else []  # of another split
         write_record(folder, RENDER, Record(subject, sorted({*kept, *written})), earlier.files, overwrite)
         remove_files(folder, written)
         paths = [os.path.join(folder, stem) for stem in stems]

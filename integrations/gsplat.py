@@ -14,18 +14,13 @@ from diff_smoe_rasterization.gaussians import divided
 from diff_smoe_rasterization.settings import BackgroundGate
 
 from ._rasterizer import share_of_gaussians
+from .contracts import OF_LATER_GSPLAT
 
 __all__ = ["compute_relocation", "quat_scale_to_covar_preci", "rasterization"]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 EVERYTHING_NEARER = 1e10  # the far_plane that leaves nothing out
-# Arguments of later versions of gsplat, with the values that switch them off. Callers spell those out.
-OF_LATER_VERSIONS = {
-    "with_ut": False, "with_eval3d": False, "return_normals": False, "global_z_order": True, "rays": None,
-    "ftheta_coeffs": None, "lidar_coeffs": None, "external_distortion_coeffs": None, "rolling_shutter": None,
-    "viewmats_rs": None, "ut_params": None, "extra_signals": None, "extra_signals_sh_degree": None,
-    "renderer_config": None}
 CAMERA_MODELS = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
 GLOBAL_SHUTTER = "GLOBAL"  # the name of the other value of rolling_shutter that switches it off
 
@@ -275,9 +270,9 @@ def _refuse_what_is_not_offered(others, **arguments):
         if value != only:
             raise NotImplementedError(f"rasterization: {name} is {value!r}; this module offers only {only!r}")
     for name, value in others.items():
-        if name not in OF_LATER_VERSIONS:
+        if name not in OF_LATER_GSPLAT:
             raise TypeError(f"rasterization: there is no argument {name}")
-        off = OF_LATER_VERSIONS[name]
+        off = OF_LATER_GSPLAT[name]
         is_off = value is None or value is off or getattr(value, "name", None) == GLOBAL_SHUTTER
         if not is_off:
             raise NotImplementedError(f"rasterization: {name} is {value!r}; this module does not offer it")

@@ -53,8 +53,6 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
                        densify_until_iter=config.densify_until_iter)
     if config.unusual_recipe():
         unusual["recipe"] = config.unusual_recipe()
-    if config.half_until_iter:
-        unusual["half_until_iter"] = config.half_until_iter
     if config.random_background:
         unusual["random_background"] = True
     if scene.missing:

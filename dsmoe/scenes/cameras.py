@@ -45,11 +45,6 @@ class Camera:
         return dataclasses.replace(self, fx=self.fx * sx, cx=self.cx * sx, fy=self.fy * sy, cy=self.cy * sy,
                                    width=width, height=height)
 
-    def halved(self) -> Camera:
-        """The same pixels, two by two, without an odd last row or column."""
-        return dataclasses.replace(self, fx=self.fx / 2, cx=self.cx / 2, fy=self.fy / 2, cy=self.cy / 2,
-                                   width=self.width // 2, height=self.height // 2)
-
     def centred(self) -> Camera:
         """The same view with the principal point moved to the image centre."""
         return dataclasses.replace(self, cx=self.width / 2, cy=self.height / 2)

@@ -1,6 +1,8 @@
 """The folder of a trained 3DGS model as a scene: the cameras of cameras.json, and what the model shows there."""
 from __future__ import annotations
 
+import collections
+import dataclasses
 import glob
 import hashlib
 import json
@@ -52,8 +54,9 @@ def read_model_layout(folder: str, config: TrainConfig) -> Layout:
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "strerror", None) or error
         raise SceneError(f"{path}: not the cameras of a 3DGS model ({reason})") from error
-    if len({camera.name for camera in cameras}) < len(cameras):  # of NeRF-synthetic's training and test views
-        raise SceneError(f"{path}: two cameras have one `img_name`; each must have its own")
+    names = collections.Counter(camera.name for camera in cameras)
+    cameras = [dataclasses.replace(camera, name=f"{camera.name}-{index}") if names[camera.name] > 1 else camera
+               for index, camera in enumerate(cameras)]  # NeRF-synthetic's training and test views share names
     train, test, split = hold_out([PosedImage(camera, "") for camera in cameras], config.test_every)
     if not train:
         raise SceneError(f"{path}: no training camera is left after the split; --test-every 0 keeps none for testing")

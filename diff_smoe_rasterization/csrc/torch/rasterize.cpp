@@ -165,7 +165,7 @@ variable_list call_rasterize(const Call& call) {
 }
 
 struct Rasterize : torch::autograd::Function<Rasterize> {
-  // tensors: those of the call, if autograd sees them.
+  // tensors: the call's, if autograd sees them.
   static variable_list forward(AutogradContext* context, at::TensorList tensors, const Call& call) {
     variable_list results = call_rasterize(call), kept = tensors.vec();
     kept.insert(kept.end(), results.begin(), results.end());

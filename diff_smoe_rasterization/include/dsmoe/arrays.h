@@ -144,7 +144,7 @@ DSMOE_HD ProjectedGradient<S> projected_gradient(const GateGradient<S>& gate, co
   return out;
 }
 
-// Writes the gradients of Gaussian i, except those of its colours.
+// Writes the gradients of Gaussian i, except by its colours.
 template <class S>
 DSMOE_HD void store_gradient(const GaussianGradient<S>& g, const GaussianGradients<S>& out, int64_t i) {
   if (out.means3D != nullptr) store3(out.means3D + 3 * i, g.mean);

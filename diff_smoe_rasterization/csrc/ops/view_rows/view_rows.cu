@@ -2,8 +2,8 @@
 // that its numbers are read once, and so that its gradients are written once.
 #include <algorithm>
 
-#include "../refuse.h"
-#include "lane_gradient.cuh"
+#include "cuda/lane_gradient.cuh"
+#include "refuse.h"
 
 namespace dsmoe {
 namespace cuda {

@@ -3,10 +3,10 @@
 #include <algorithm>
 #include <cstring>
 
-#include "../refuse.h"
+#include "cpu/parallel.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
-#include "parallel.h"
+#include "refuse.h"
 
 namespace dsmoe {
 namespace cpu {
