@@ -255,13 +255,13 @@ def resolve_lens(settings: GaussianRasterizationSettings) -> Tuple[int, List[flo
     The core refuses wrong counts and values.
     """
     model, distortion, principal_point = settings.camera_model, settings.distortion, settings.principal_point
-    if model == "pinhole":
-        for name, value in (("distortion", None if len(distortion) == 0 else distortion),
-                            ("principal_point", principal_point)):
-            if value is not None:
-                other = "its principal point is in projmatrix" if name == "principal_point" else \
-                    f"name the lens that has it: {', '.join(CAMERA_MODELS[2:5])}"
-                raise ValueError(f"{name} is {value!r}, but camera_model is 'pinhole'; {other}")
+    if model == "pinhole":  # which every eager call of a trainer comes through
+        if len(distortion) > 0:
+            raise ValueError(f"distortion is {distortion!r}, but camera_model is 'pinhole'; name the lens that has it: "
+                             f"{', '.join(CAMERA_MODELS[2:5])}")
+        if principal_point is not None:
+            raise ValueError(f"principal_point is {principal_point!r}, but camera_model is 'pinhole'; its principal "
+                             "point is in projmatrix")
         return 0, []
     if model not in CAMERA_MODELS:
         raise ValueError(f"camera_model is {model!r}; it must be one of {', '.join(CAMERA_MODELS)}")

@@ -209,8 +209,9 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
     if config.strategy == STRATEGY and not arguments.resume and "budget" not in given_options(arguments):
-        print("note: that number is chosen for the scene; --budget N makes more or fewer, and --strategy 3dgs is the "
-              "recipe of 3DGS")
+        whose = "that of the model" if config.init else "chosen for the scene"
+        print(f"note: that number is {whose}; --budget N makes more or fewer, and --strategy 3dgs is the recipe of "
+              "3DGS")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
@@ -272,7 +273,8 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     if given.get("init"):
         _start_from(arguments)
     if not arguments.resume or "scene" in given and (presets or not holds_run(run)):
-        return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
+        earlier_run = TrainConfig.load(run, continues=True) if arguments.resume and holds_run(run) else None
+        return config_from_arguments(arguments, earlier_run)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
 
 
@@ -354,7 +356,7 @@ def _render(arguments: argparse.Namespace) -> None:
 
 def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outputs: List[str]) -> None:
     from .filming import film
-    from .opening import open_trained
+    from .inspection import open_trained
 
     trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                            **overrides)

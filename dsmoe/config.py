@@ -32,6 +32,9 @@ IMAGES = "images"  # folder of a COLMAP scene
 PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
+# Options without which a model is not rendered as it was trained.
+OF_IMAGES = ("scene", "blend_mode", "background_gate", "antialiasing", "white_background", "resolution", "images",
+             "principal_point", "test_every", "iterations", "sh_degree", "seed")
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
           "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
@@ -305,16 +308,24 @@ class TrainConfig:
         return dataclasses.asdict(self)
 
     @classmethod
-    def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
-        """The options that `record` gave. Raises ValueError if one is missing: a default would be another run."""
-        missing = sorted({option.name for option in dataclasses.fields(cls)} - {*values})
+    def of_record(cls, values: Dict[str, Any], continues: bool = True) -> TrainConfig:
+        """The options that `record` gave. Raises ValueError if one is missing: a default would be another run.
+
+        continues: False if the run is only looked at. Then those may be missing that say nothing of its images: another
+        version wrote the record.
+        """
+        needed = {option.name for option in dataclasses.fields(cls)} if continues else {*OF_IMAGES}
+        missing = sorted(needed - {*values})
         if missing:
             raise ValueError(f"the option {', '.join(missing)} is missing")
         return cls(**values)
 
     @classmethod
-    def load(cls, folder: str) -> TrainConfig:
-        """Reads OUT/config.json. Raises ConfigError if the file is absent or wrong, naming file and reason."""
+    def load(cls, folder: str, continues: bool = False) -> TrainConfig:
+        """Reads OUT/config.json. Raises ConfigError if the file is absent or wrong, naming file and reason.
+
+        continues: whether the run is to go on, which another version cannot do.
+        """
         path = os.path.join(folder, CONFIG_NAME)
         if not is_folder(folder):
             raise ConfigError(f"{folder}: no such folder; name the output folder of `dsmoe train`")
@@ -341,7 +352,7 @@ class TrainConfig:
                              f"it must be one of {', '.join(BLEND_MODES)}")
         values["output"] = folder  # the folder may have been moved
         try:
-            return cls.of_record(values).validate()
+            return cls.of_record(values, continues).validate()
         except (TypeError, ValueError, OverflowError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from error
 
@@ -351,7 +362,7 @@ class TrainConfig:
 
         scene_option: what says where the scene lies now, for that error. resumes: whether that run goes on with them.
         """
-        earlier = cls.load(folder)
+        earlier = cls.load(folder, continues=resumes)
         config = earlier._changed(options)
         if resumes:
             earlier.check_continued_by(config)

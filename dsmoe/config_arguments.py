@@ -112,10 +112,8 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
     if chooses or getattr(arguments, "scale_recipe", False):
         config = dataclasses.replace(config.shortened(), **options)
     if chooses and earlier:
-        names = {"budget", "init_points"}
-        if earlier.blend_mode == config.blend_mode:
-            names.add("background_gate_start")
-        config = dataclasses.replace(config, **{name: getattr(earlier, name) for name in names - {*given}})
+        kept = {"budget", "init_points"} - {*given}
+        config = dataclasses.replace(config, **{name: getattr(earlier, name) for name in kept})
     elif chooses:
         dataclasses.replace(config, budget=config.budget or NUMBERS[config.device].least).validate()  # before it reads
         config = dataclasses.replace(config, **chosen_for_scene(config, given))

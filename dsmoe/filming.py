@@ -9,8 +9,7 @@ from PIL import Image
 from .choices import ORBIT_FRAMES, VIDEO_FPS
 from .early import check_orbit
 from .errors import TrainerError
-from .inspection import said_of_images, to_image, write_images
-from .opening import Trained
+from .inspection import Trained, said_of_images, to_image, write_images
 from .results.video import check_folder, check_video, is_video, write_video
 from .scenes.cameras import Camera
 from .system.progress import progress_bar

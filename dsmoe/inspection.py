@@ -1,9 +1,9 @@
-"""What is done with a trained model: measure it again, write its images."""
+"""What is done with a trained model: open it with its cameras, measure it again, write its images."""
 from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
@@ -11,7 +11,9 @@ import torch
 from PIL import Image
 
 from .config import CHECKPOINT_NAME, LEARNED, TrainConfig
+from .early import check_source
 from .errors import TrainerError, printable
+from .model import GaussianModel
 from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, model_path
@@ -20,9 +22,10 @@ from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
 from .results.video import check_folder
 from .scenes.cameras import Camera
+from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
 from .system.device import check_device
-from .system.files import is_file, write_json_atomically
+from .system.files import is_file, is_folder, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.progress import progress_bar
 from .train import PER_VIEW_NAME
@@ -67,6 +70,8 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     training = evaluate(renderer, scene.train, device, progress, psnr_alone, passes=1).metrics["psnr"]
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, training,
                      renderer.background_gate)
+    if earlier and "start" in earlier[0]:  # of `dsmoe simplify`
+        row["start"] = earlier[0]["start"]
     if split == "test" and not is_other and not opened.so_far:
         try:
             write_results(output, [row])
@@ -209,3 +214,51 @@ def to_image(color: torch.Tensor) -> Image.Image:
     """A rendering [3, H, W] as an 8-bit image, rounded as the metrics round."""
     values = (quantised(color.detach()) * 255).round().to(torch.uint8)
     return Image.fromarray(np.ascontiguousarray(values.permute(1, 2, 0).cpu().numpy()))
+
+
+@dataclass(frozen=True)
+class Trained:
+    """An opened model."""
+
+    config: TrainConfig  # the run's; of a .ply only background, resolution and scene mean something
+    path: str  # the .ply; of a training that has not ended, the checkpoint
+    renderer: Renderer
+    cameras: List[Camera]  # the scene's test views, else its training views, upright; one on the orbit without a scene
+    orbit: Orbit
+    has_ended: bool = True  # the training
+
+
+def open_trained(source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
+                 device: str = "cpu", **options: Any) -> Trained:
+    """Opens the output folder of `dsmoe train`, before its end the checkpoint in it, or a .ply.
+
+    blend_mode, background_gate: of a .ply that does not record them (else alpha); they must agree if something does.
+    options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. There are none if the
+    run's scene is not there. Raises TrainerError.
+    """
+    check_device(device)
+    check_source(source)
+    if is_folder(source):
+        config = TrainConfig.load(source).changed(**options)
+        renderer, path, so_far = open_run(config, blend_mode, background_gate, device)
+    else:
+        config, path, so_far = TrainConfig(blend_mode="alpha", **options).validate(), source, None
+        renderer = open_renderer(config, path, blend_mode, device, asked_gate=background_gate)
+    cameras, orbit = places(config, renderer.model, needed="scene" in options)
+    return Trained(config, path, renderer, cameras, orbit, so_far is None)
+
+
+def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:
+    """The cameras for a model: the test views of config.scene, else its training views, and their orbit.
+
+    The views are upright: photographs are often tilted.
+
+    If the scene is not there, it is an orbit about the Gaussians and one camera on it. needed: raise TrainerError
+    then.
+    """
+    if needed or is_folder(config.scene):
+        every = load_cameras(config, "all")
+        orbit = orbit_of_cameras(every)
+        return [upright(camera, orbit.up) for camera in load_cameras(config, "test") or every], orbit
+    orbit = orbit_of_points(model.raw["means3D"].detach().cpu().double().numpy())
+    return orbit.cameras(1, default_camera()), orbit

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from typing import Any, Collection, Dict, NamedTuple, Optional
 
-from .config import LEARNED, TrainConfig, learned_gate_of
+from .config import TrainConfig
 from .errors import ConfigError
 
 STRATEGY = "importance"
@@ -58,7 +58,6 @@ def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Di
 
 def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, Any]:
     """Options that depend on the scene, of those whose names are not given. Raises SceneError if it cannot be read."""
-    from .scenes.images import has_transparency
     from .scenes.scene import read_layout
     from .starting import read_start
     from .training.importance_strategy import reached_from
@@ -75,8 +74,4 @@ def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, A
         if layout.points.measured:
             wanted = min(max(numbers.per_point * points, numbers.least), numbers.most)
         chosen["budget"] = min(wanted, reached_from(config, points))
-    if (config.background_gate == LEARNED and "background_gate_start" not in given
-            and not layout.model and has_transparency(layout.train[0].path)):
-        # Empty space shows the background; a gate that starts low takes most of a short training to rise.
-        chosen["background_gate_start"] = learned_gate_of("smoe_eq7")["background_gate_start"]
     return chosen

@@ -89,10 +89,8 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
         remove_files(output, files)
         rows = []
         for mode in MODES:
-            own = config.changed(blend_mode=mode, output=os.path.join(output, mode))
-            if own.strategy == STRATEGY:
-                own = own.changed(**chosen_for_scene(own, ("init_points",)))  # what only this mode has
-            rows.append(train(own, overwrite=True, progress=progress, scene=scene))
+            rows.append(train(config.changed(blend_mode=mode, output=os.path.join(output, mode)), overwrite=True,
+                              progress=progress, scene=scene))
             shutil.copyfile(model_path(os.path.join(output, mode), config.iterations),
                             os.path.join(output, mode + ".ply"))
         write_results(output, rows)

@@ -17,6 +17,7 @@ from .scenes.scene import Scene, describe_scene, load_scene, read_layout
 from .starting import Found, Start, blend_options, check_start, find_model, read_start, start_renderer
 from .system.device import check_device
 from .system.files import is_folder
+from .system.output_folder import make_folder, only_one
 from .train import earlier_files, train
 
 UNTIL = 0.35  # as with --fast: removals end at 0.95 of this part of the iterations, moves at 1.33 of it
@@ -67,7 +68,7 @@ def simplify(model: str, output: str, *, scene: Optional[str] = None, budget: Op
     earlier_files(config, resume, overwrite)
     measured = _measure(config, start, say, progress, finds_center)
     if loses is None:
-        row = _run(measured, resume, overwrite, progress, say)
+        row = train(measured.config, resume, overwrite, progress, scene=measured.scene, say=say)
     else:
         row = _fewest(measured, numbers, loses, resume, overwrite, progress, say)
     row["start"] = _figures(measured)
@@ -83,7 +84,7 @@ def _config(model: str, found: Found, start: Start, given: Dict[str, Any]) -> Tr
     if start.blend_mode != "alpha" and mode != start.blend_mode:
         raise ConfigError(f"{model} is blended by {start.blend_mode}, and --blend-mode is {mode}; simplify it as it "
                           "is, then `dsmoe export OUT --bake alpha -o model.ply` makes an alpha model of it")
-    recorded = dict(found.options)
+    recorded = {**found.options, **({} if given.get("scene") else found.teacher)}
     if mode != recorded.pop("blend_mode", mode):
         recorded.pop("background_gate", None)
     options = {**blend, **recorded, **given, "blend_mode": mode, "init": found.path}
@@ -133,16 +134,11 @@ def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], No
             f"{start.blend_mode}, {os.path.getsize(start.path) / 1e6:.1f} MB")
         say(describe_scene(scene, layout, config))
     quality = check_start(scene, config)
-    if finds_center and quality.centred > quality.psnr:
+    if finds_center and quality.is_centred:
         scene, config = scene.centred(), config.changed(principal_point="centre")
     if say and scene.kind != "model":  # which agrees with itself
         say(quality.text(config))
     return _Measured(start, start_renderer(start, config), scene, config)
-
-
-def _run(measured: _Measured, resume: bool, overwrite: bool, progress: bool,
-         say: Optional[Callable[[str], None]]) -> Dict[str, Any]:
-    return train(measured.config, resume, overwrite, progress, scene=measured.scene, say=say)
 
 
 def _fewest(measured: _Measured, budgets: List[int], loses: float, resume: bool, overwrite: bool, progress: bool,
@@ -158,17 +154,19 @@ def _fewest(measured: _Measured, budgets: List[int], loses: float, resume: bool,
         return float(evaluate(renderer, scene.train, device, passes=1).metrics["psnr"] or 0)
 
     before = train_psnr(measured.renderer)
-    for budget in budgets:
-        config = measured.config.changed(budget=budget)
-        row = _run(measured._replace(config=config), resume, overwrite, progress, say)
-        path = model_path(config.output, config.iterations)
-        after = train_psnr(open_renderer(config, path, None, device))
-        lost = before - after
-        if say:
-            say(f"{budget:,} Gaussians: {after:.2f} dB on the training images, {lost:.2f} dB less than the model")
-        if lost <= loses:
-            return row
-        resume, overwrite = False, True
+    make_folder(measured.config.output)
+    with only_one(measured.config.output) as lock:  # over all of them
+        for budget in budgets:
+            config = measured.config.changed(budget=budget)
+            row = train(config, resume, overwrite, progress, scene=measured.scene, say=say, lock=lock)
+            path = model_path(config.output, config.iterations)
+            after = train_psnr(open_renderer(config, path, None, device))
+            lost = before - after
+            if say:
+                say(f"{budget:,} Gaussians: {after:.2f} dB on the training images, {lost:.2f} dB less than the model")
+            if lost <= loses:
+                return row
+            resume, overwrite = False, True
     raise TrainerError(f"{measured.config.output}: even {budgets[-1]:,} Gaussians lose {lost:.2f} dB, more than "
                        f"--loses {loses:g}; the folder holds that model")
 
@@ -179,5 +177,6 @@ def _figures(measured: _Measured) -> Dict[str, Any]:
                                       measured.config.device, passes=1)
     metrics = {name: None if measured.scene.kind == "model" else value for name, value in evaluation.metrics.items()}
     return {"blend_mode": measured.start.blend_mode, "background_gate": measured.start.background_gate,
+            "protocol": {} if measured.start.faint_below is None else {"faint_below": measured.start.faint_below},
             **metrics, "num_gaussians": measured.start.count, "train_seconds": None, "fps": evaluation.fps,
             "bytes": os.path.getsize(measured.start.path)}

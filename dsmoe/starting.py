@@ -74,6 +74,7 @@ class Found:
 
     path: str
     options: Dict[str, Any] = field(default_factory=dict)  # of TrainConfig, that its folder records; `scene` too
+    teacher: Dict[str, Any] = field(default_factory=dict)  # others in their place, for its renderings as the scene
 
 
 class Quality(NamedTuple):
@@ -83,13 +84,20 @@ class Quality(NamedTuple):
     psnr: float
     centred: float  # with principal points in the images' centres
 
+    @property
+    def is_centred(self) -> bool:
+        """Whether the model's program had them there."""
+        return self.centred > self.psnr + CLEARLY
+
     def text(self, config: TrainConfig) -> str:
         """What to say of it."""
-        is_centred = config.principal_point == "centre"
-        text = f"it has {self.centred if is_centred else self.psnr:.2f} dB on {self.views} of the training images"
-        if is_centred or self.centred <= self.psnr + CLEARLY:
-            return text
-        return f"{text}; note: with --principal-point centre it has {self.centred:.2f} dB"
+        if not self.is_centred:
+            return f"it has {self.psnr:.2f} dB on {self.views} of the training images"
+        if config.principal_point == "centre":
+            return (f"it has {self.centred:.2f} dB on {self.views} of the training images with principal points in "
+                    f"their centres, which are taken, and {self.psnr:.2f} dB as the scene has them")
+        return (f"it has {self.psnr:.2f} dB on {self.views} of the training images; note: with --principal-point "
+                f"centre it has {self.centred:.2f} dB")
 
 
 def read_start(path: str) -> Start:
@@ -133,11 +141,10 @@ def find_model(source: str) -> Found:
         raise TrainerError(f"{source}: no model is in it: neither {CONFIG_NAME} of `dsmoe train` nor point_cloud/"
                            "iteration_N/point_cloud.ply of 3DGS")
     options = _options_of_3dgs(source)
-    if not is_folder(options.get("scene", "")):
-        options.pop("scene", None)
-        if is_file(os.path.join(source, CAMERAS)):
-            options["scene"] = source
-    return Found(path, options)
+    if is_folder(options.get("scene", "")):
+        return Found(path, options)
+    options.pop("scene", None)
+    return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {})
 
 
 def _found_run(folder: str) -> Found:
@@ -145,21 +152,21 @@ def _found_run(folder: str) -> Found:
     path = model_path(folder, config.iterations)
     if not is_file(path):
         raise TrainerError(f"{path}: no such file; the training in {folder} has not ended (continue it with --resume)")
-    names = ["test_every", "white_background", "random_background", "antialiasing"]
+    names = ["test_every", "white_background", "random_background", "antialiasing", "images", "strict", "resolution",
+             "principal_point", "lenses"]
     if config.background_gate != LEARNED:
         names += ["blend_mode", "background_gate"]
-    photographs = is_folder(config.scene)
-    if photographs:
-        names += ["scene", "images", "strict", "resolution", "principal_point", "lenses"]
     options = {name: getattr(config, name) for name in names}
-    if not photographs and is_file(os.path.join(folder, CAMERAS)):
-        options.update(scene=folder, resolution=1)  # the cameras are those of the resized images
-    return Found(path, options)
+    if is_folder(config.scene):
+        return Found(path, {**options, "scene": config.scene})
+    # Its cameras.json has those of the resized images.
+    teacher = {"scene": folder, "resolution": 1, "principal_point": "scene", "lenses": TrainConfig().lenses}
+    return Found(path, options, teacher if is_file(os.path.join(folder, CAMERAS)) else {})
 
 
 def _options_of_3dgs(folder: str) -> Dict[str, Any]:
-    """What cfg_args, a Namespace as text, says of the training; its loader moves principal points to the centre."""
-    options: Dict[str, Any] = {"principal_point": "centre"}
+    """What cfg_args, a Namespace as text, says of the training. Where it had principal points is seen later."""
+    options: Dict[str, Any] = {}
     path = os.path.join(folder, CFG_ARGS)
     if not is_file(path):
         return options

@@ -219,6 +219,9 @@ def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = F
     Raises TrainerError if something is there that this run must not go on with, or replace.
     """
     output = config.output
+    if config.init and os.path.realpath(config.init).startswith(os.path.join(os.path.realpath(output), "")):
+        raise TrainerError(f"{config.init}, the model to start from, lies in {output}, the folder to write; choose "
+                           "another folder with -o")
     record = read_record(output, TRAIN)
     models = os.path.join(output, FOLDER)
     if not holds_run(output):
@@ -234,7 +237,7 @@ def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = F
         raise TrainerError(f"{output} already holds a training run; continue it with --resume, "
                            "replace it with --overwrite, or choose another folder")
     elif resume or not record:  # a record is enough to be replaced
-        earlier = TrainConfig.load(output)
+        earlier = TrainConfig.load(output, continues=resume)
         if resume:
             earlier.check_continued_by(config)
         record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
@@ -262,7 +265,7 @@ def room_text(trainer: Trainer) -> Optional[str]:
 
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
           scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None, group: Optional[Group] = None,
-          say: Optional[Callable[[str], None]] = None) -> Dict[str, Any]:
+          say: Optional[Callable[[str], None]] = None, lock: Optional[IO[str]] = None) -> Dict[str, Any]:
     """Trains a scene into config.output; returns the row of results.json.
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
@@ -270,7 +273,8 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     is extended: its milestones stay, and if it had ended it lacks the update of its last step. overwrite: replace a
     run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, if one is at
     hand. group: the processes that train together, if there are several; all of them call this. say: is called
-    with a line about what was loaded; with it a training on the CPU also says how long it takes. Raises TrainerError
+    with a line about what was loaded; with it a training on the CPU also says how long it takes. lock: the folder's, if
+    the caller keeps it over several runs. Raises TrainerError
     before training starts if anything does not fit, such as another run at work in the folder.
     """
     if resume and overwrite:
@@ -291,7 +295,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         if say:
             say(f"{config.init}: {quality.text(config)}")
     make_folder(config.output)  # a folder that cannot be made is told before images are read
-    with only_one(config.output) as lock:
+    with contextlib.nullcontext(lock) if lock else only_one(config.output) as lock:
         earlier = earlier_files(config, resume, overwrite)  # again: another run may have been at work there
         scene = scene or load_scene(config, progress, layout)
         if config.random_background and config.background_gate == 0:

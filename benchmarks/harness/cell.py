@@ -24,7 +24,7 @@ from ..errors import TrainerError
 from ..system.children import die_with_parent
 from ..system.files import write_json_atomically
 from ..system.output_folder import locked
-from .logs import last_line
+from .errors import last_line
 from .names import ROW_NAME, read_json
 
 LOG_NAME = "log.txt"

@@ -12,7 +12,7 @@ from diff_smoe_rasterization.settings import GATED_MODES
 from ..choices import BAKE_ITERATIONS
 from ..choices import EXPORT_FORMATS as FORMATS
 from ..errors import TrainerError, printable
-from ..opening import Trained, open_trained
+from ..inspection import Trained, open_trained
 from ..results.modelfile import save_model
 from ..results.pictures import evenly_spaced
 from ..results.rows import blend_name, viewer_warning

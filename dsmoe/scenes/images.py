@@ -218,15 +218,6 @@ def size_of_image(posed: PosedImage) -> Tuple[int, int]:
     return image_size(posed.path) if posed.path else (posed.camera.width, posed.camera.height)
 
 
-def has_transparency(path: str) -> bool:
-    """`is_transparent` of a file, by its header. Raises SceneError."""
-    try:
-        with open_image(path) as file:
-            return is_transparent(file)
-    except UNREADABLE as error:
-        raise unreadable(path, error) from error
-
-
 def image_size(path: str) -> Tuple[int, int]:
     """(width, height) from an image's header. Raises SceneError."""
     return _size(path, path)

@@ -6,7 +6,7 @@ from typing import Any, List, Optional, Tuple
 
 from ..config import CHECKPOINT_NAME, TrainConfig
 from ..errors import TrainerError
-from ..opening import Trained, open_trained, places
+from ..inspection import Trained, open_trained, places
 from ..results.modelfile import model_path
 from ..results.rendering import Renderer, background_color
 from ..scenes.cameras import Camera

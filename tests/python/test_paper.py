@@ -105,6 +105,22 @@ def test_every_file_of_the_map_and_of_the_method_is_there():
         assert len(paths) > 5 and not [path for path in paths if not (ROOT / path).exists()], page
 
 
+def test_what_the_map_names_in_blend_h_is_there():
+    source = (ROOT / "diff_smoe_rasterization" / "include" / "dsmoe" / "blend.h").read_text(encoding="utf-8")
+    named = re.findall(r"blend\.h`: ((?:`[^`]*`(?:, )?)+)", PAPER.read_text(encoding="utf-8"))
+    names = [name for some in named for name in re.findall(r"`([^`]*)`", some)]
+    assert {f"Blend<BlendMode::k{mode}>" for mode in ("Alpha", "Smoe", "SmoeEq7", "SmoeTn", "SmoeStd")} <= set(names)
+    assert not [name for name in names
+                if not re.search(rf"(?:struct|PairWeight<Real>|PairGradient<Real>) {name}[ (]", source)]
+
+
+def test_the_caption_of_the_edge_has_what_its_table_has():
+    row, = rows_of(PAPER.read_text(encoding="utf-8"), r"0\.25, 600")
+    caption = re.search(r"edge\.png\)\n\n(.*?)\n\n", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    figures = re.findall(r"\d\d\.\d", row)
+    assert len(figures) == 4 and set(figures) <= set(re.findall(r"\d\d\.\d", caption.group(1)))
+
+
 @pytest.mark.skipif(not any(tables.RESULTS.glob("*.jsonl")),
                     reason="the rows are in the repository, not in its source distribution")
 def test_what_the_pages_say_in_sentences_is_in_the_rows():

@@ -30,8 +30,7 @@ from ...results.pictures import evenly_spaced
 from ...scenes.images import View
 from ...scenes.scene import Scene
 from ...system.children import die_with_parent
-from ..errors import BenchError
-from ..logs import last_line
+from ..errors import BenchError, last_line
 from ..measure import Measures
 from ..names import COUNTED_BY, RECIPE, read_json
 from ..protocol import commit_of, config_of

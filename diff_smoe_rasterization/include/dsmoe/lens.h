@@ -302,7 +302,8 @@ struct LensCalibration {
   double fx = 0, fy = 0;  // focal lengths, pixels; orthographic: pixels by unit of length. Equirectangular: not read
   double cx = 0, cy = 0;  // principal point, pixels; the centre of the first pixel is (0.5, 0.5). Likewise
   // kOpencv: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4, as OpenCV has them: none, 1, 2, 4, 5, 8 or 12.
-  // kFisheye: k1 k2 k3 k4: none, 1, 2 or 4. kThinPrismFisheye: k1 k2 p1 p2 k3 k4 sx1 sy1, as COLMAP has them: none or 8.
+  // kFisheye: k1 k2 k3 k4: none, 1, 2 or 4. kThinPrismFisheye: k1 k2 p1 p2 k3 k4 sx1 sy1, as COLMAP has them: none
+  // or 8.
   std::vector<double> distortion;
 };
 constexpr int kMostDistortion = 12;

@@ -14,7 +14,7 @@ from diff_smoe_rasterization.reference import sh_basis
 from dsmoe.cli import main
 from dsmoe.export.glb import glb_bytes
 from dsmoe.export.rows import y_up
-from dsmoe.opening import open_trained
+from dsmoe.inspection import open_trained
 
 COUNT = 20
 KHR = "KHR_gaussian_splatting"

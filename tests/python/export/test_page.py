@@ -11,8 +11,7 @@ from browser import browser  # noqa: F401
 from diff_smoe_rasterization import io
 from dsmoe.cli import main
 from dsmoe.export import html
-from dsmoe.inspection import to_image
-from dsmoe.opening import open_trained
+from dsmoe.inspection import open_trained, to_image
 from dsmoe.results.modelfile import load_model
 from dsmoe.results.rendering import Renderer
 from dsmoe.scenes.orbit import default_camera, orbit_of_points

@@ -133,14 +133,19 @@ def test_how_a_gate_is_learned_is_refused_where_none_is(monkeypatch, option):
     parse("--blend-mode", "smoe", "--background-gate", "learned", *given)
 
 
-@pytest.mark.parametrize("option", ["background_gate", "blend_mode", "seed"])
+@pytest.mark.parametrize("option", ["background_gate", "blend_mode", "seed", "feature_lr"])
 def test_an_option_that_the_file_lacks_gets_no_default(tmp_path, option):
+    """But a run that is only looked at may lack what says nothing of its images."""
     TrainConfig(scene="s", output=str(tmp_path)).save(str(tmp_path))
     values = json.loads((tmp_path / "config.json").read_text())
     del values[option]
     (tmp_path / "config.json").write_text(json.dumps(values))
-    with pytest.raises(ConfigError, match=f"config.json: .*{option} is "):
-        TrainConfig.load(str(tmp_path))
+    for continues in (True, False):
+        if option == "feature_lr" and not continues:
+            assert TrainConfig.load(str(tmp_path)).feature_lr == TrainConfig().feature_lr
+            continue
+        with pytest.raises(ConfigError, match=f"config.json: .*{option} is "):
+            TrainConfig.load(str(tmp_path), continues)
 
 
 @pytest.mark.parametrize("option, value, words", [

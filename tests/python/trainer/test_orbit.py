@@ -13,8 +13,7 @@ from PIL import Image
 from diff_smoe_rasterization import io
 from dsmoe.cli import main
 from dsmoe.errors import SceneError
-from dsmoe.inspection import to_image
-from dsmoe.opening import open_trained
+from dsmoe.inspection import open_trained, to_image
 from dsmoe.results.video import write_video
 from dsmoe.scenes.orbit import default_camera, look_at, orbit_of_cameras, orbit_of_points, upright
 

@@ -95,10 +95,9 @@ def test_a_number_does_not_follow_random_points(nerf_folder):
         config = TrainConfig(scene=nerf_folder, strategy="importance", blend_mode="smoe", **options)
         return chosen_for_scene(config, options)
 
-    assert chosen() == chosen(init_points=50_000) == {
-        "budget": NUMBERS["cpu"].without_points, "background_gate_start": 1.0}, "its photographs have transparency"
+    assert chosen() == chosen(init_points=50_000) == {"budget": NUMBERS["cpu"].without_points}
     assert chosen(device="cuda")["budget"] == NUMBERS["cuda"].without_points
-    assert chosen(background_gate_start=0.3, budget=40) == {}
+    assert chosen(budget=40) == {}
 
 
 def test_as_many_points_are_taken_as_time_allows(tiny_scene, monkeypatch):

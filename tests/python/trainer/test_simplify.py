@@ -200,6 +200,44 @@ def test_a_run_whose_scene_is_gone_is_its_own_teacher(run, tmp_path):
             assert np.allclose(view.camera.translation, photograph.camera.translation, atol=1e-12)
 
 
+def test_a_run_knows_how_its_scene_is_loaded_wherever_that_lies(run, tmp_path):
+    scene, moved = str(tmp_path / "scene"), str(tmp_path / "moved")
+    shutil.copytree(run.scene, scene)
+    config = run.changed(scene=scene, init=ply_of(run), iterations=4, densify_until_iter=0, principal_point="centre",
+                         output=str(tmp_path / "run"))
+    train(config, progress=False)
+    os.rename(scene, moved)
+    row = simplify(config.output, str(tmp_path / "out"), scene=moved, budget=40, **SHORT)
+    assert (row["protocol"]["scene_kind"], row["protocol"]["resolution"]) == ("colmap", 30)
+    assert row["protocol"]["principal_point"] == "centre"
+
+
+def test_a_model_in_the_folder_to_write_is_refused(run, tmp_path, capsys):
+    """--overwrite would remove it."""
+    copy = str(tmp_path / "run")
+    shutil.copytree(run.output, copy)
+    before = sorted(path for path, _, _ in os.walk(copy))
+    for words in (["simplify", copy, "--budget", "40"], ["simplify", model_path(copy, 250), "--scene", run.scene,
+                                                         "--budget", "40"], ["train", run.scene, "--init", copy]):
+        assert main([*words, "-o", copy, "--overwrite", "--device", "cpu"]) == 1
+        text = capsys.readouterr().err
+        assert text.count("\n") == 1 and "lies in" in text and "choose another folder with -o" in text
+    assert sorted(path for path, _, _ in os.walk(copy)) == before and os.path.isfile(model_path(copy, 250))
+
+
+def test_what_a_model_says_of_faint_pairs_is_kept(run, tmp_path, capsys):
+    ply, output = str(tmp_path / "paper.ply"), str(tmp_path / "out")
+    stored = dataclasses.replace(io.read_gaussians(ply_of(run)), blend_mode="smoe", background_gate=1.0,
+                                 comments=("faint_below 2",))
+    io.write_gaussians(ply, stored)
+    assert main(["simplify", ply, "--scene", run.scene, "--budget", "40", "-o", output, "--iterations", "4",
+                 "--resolution", "30", "--quiet"]) == 0
+    assert TrainConfig.load(output).faint_below == 2
+    assert capsys.readouterr().out.count("all pairs") == 2, "the model and the result"
+    assert main(["eval", output, "--device", "cpu"]) == 0
+    assert results_of(output)[0]["start"]["protocol"] == {"faint_below": 2}, "measured anew it is kept"
+
+
 def test_a_model_folder_says_where_and_how_it_was_trained(run, tmp_path):
     (tmp_path / "model").mkdir()
     text = (f"Namespace(sh_degree=3, source_path={run.scene!r}, model_path='x', images='images', resolution=30, "
@@ -208,7 +246,7 @@ def test_a_model_folder_says_where_and_how_it_was_trained(run, tmp_path):
     found = find_model(folder)
     assert found.path == model_path(folder, 30)
     assert found.options == {"scene": run.scene, "images": "images", "resolution": 30, "white_background": False,
-                             "antialiasing": False, "principal_point": "centre", "test_every": 0}
+                             "antialiasing": False, "test_every": 0}
     row = simplify(folder, str(tmp_path / "out"), budget=40, **SHORT)
     assert row["protocol"]["scene_kind"] == "colmap" and row["psnr"] is None, "it had trained on all images"
 
@@ -229,9 +267,14 @@ def test_where_the_models_program_had_its_principal_points_is_seen(run, tmp_path
     words = [ply_of(run), "--scene", scene, "--budget", "40", "--iterations", "20", "--resolution", "30", "--quiet"]
     assert main(["simplify", *words, "-o", str(tmp_path / "out")]) == 0
     assert TrainConfig.load(str(tmp_path / "out")).principal_point == "centre"
+    assert "with principal points in their centres, which are taken" in capsys.readouterr().out
     assert main(["simplify", *words, "-o", str(tmp_path / "out"), "--resume"]) == 0
     assert main(["simplify", *words, "-o", str(tmp_path / "asked"), "--principal-point", "scene"]) == 0
     assert TrainConfig.load(str(tmp_path / "asked")).principal_point == "scene"
+    (tmp_path / "model").mkdir()
+    folder = model_folder(run, tmp_path / "model", f"Namespace(source_path={scene!r}, resolution=30, eval=True)")
+    assert simplify(folder, str(tmp_path / "3dgs"), budget=40, iterations=4, progress=False)["protocol"][
+        "principal_point"] == "centre"
     capsys.readouterr()
     assert main(["train", scene, "--init", ply_of(run), "-o", str(tmp_path / "init"), "--iterations", "2",
                  "--resolution", "30", "--quiet"]) == 0
