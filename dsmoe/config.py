@@ -93,6 +93,9 @@ class TrainConfig:
     principal_point: str = _option(
         "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
         choices=PRINCIPAL_POINTS)
+    lenses: str = _option(
+        "undistort", "undistort: images of distorted lenses and fisheyes become those of a pinhole, by OpenCV; native: "
+                     "they stay, and Gaussians are projected through the lens", choices=("undistort", "native"))
     test_every: int = _option(
         8, "every so many images, sorted by name, one is kept for testing, the first among them; 0: none. A scene that "
            "lists its test images itself keeps those")

@@ -15,6 +15,7 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES
 
 from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of
+from .early import check_model
 from .errors import ConfigError, TrainerError
 from .export.glb import glb_gaussians
 from .export.splat import splat_gaussians
@@ -122,11 +123,9 @@ def read_start(path: str) -> Start:
 
 def find_model(source: str) -> Found:
     """The model in a file, an output folder of `dsmoe train` or a model folder of 3DGS. Raises TrainerError."""
+    check_model(source)
     if is_file(source):
         return Found(source)
-    if not is_folder(source):
-        raise TrainerError(f"{source}: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of "
-                           "`dsmoe train` or a model folder of 3DGS")
     if holds_run(source):
         return _found_run(source)
     path = latest_model(source)
@@ -151,7 +150,7 @@ def _found_run(folder: str) -> Found:
         names += ["blend_mode", "background_gate"]
     photographs = is_folder(config.scene)
     if photographs:
-        names += ["scene", "images", "strict", "resolution", "principal_point"]
+        names += ["scene", "images", "strict", "resolution", "principal_point", "lenses"]
     options = {name: getattr(config, name) for name in names}
     if not photographs and is_file(os.path.join(folder, CAMERAS)):
         options.update(scene=folder, resolution=1)  # the cameras are those of the resized images

@@ -66,16 +66,11 @@ def of_rasterizers(tree: ast.Module, local: Set[str]) -> Iterator[str]:
             yield from (fact for package in file.owners(call.func.value, call)
                         for fact in tagged(package, f"asks {call.func.attr}"))
     for line in file.all(ast.Assign):
-        results = getattr(line.targets[0], "elts", ())
-        if not results or any(isinstance(one, ast.Starred) for one in results):
-            continue
-        named = "returns " + ", ".join(getattr(one, "id", "_") for one in results)
         if isinstance(line.value, ast.Call):
-            owners = file.owners(line.value.func, line)
-            yield from (fact for package in owners for fact in tagged(package, named))
-        else:  # out = rasterizer(...); a, b = out: it may depend on len(out)
-            kept = file.kept(_path(line.value), line)
-            yield from (fact for package in kept for fact in tagged(package, named.replace("returns", "may return")))
+            results = getattr(line.targets[0], "elts", ())
+            is_seen = results and not any(isinstance(one, ast.Starred) for one in results)
+            named = "returns " + ", ".join(getattr(one, "id", "_") for one in results) if is_seen else "keeps results"
+            yield from (fact for package in file.owners(line.value.func, line) for fact in tagged(package, named))
 
 
 class _File:
@@ -87,7 +82,6 @@ class _File:
         self._note(tree, None)
         self.bound: Dict[Tuple[int, str], Set[Tuple[str, str]]] = {}  # names that were imported: package, what
         self.made: Dict[Tuple[int, str], Set[str]] = {}  # names of rasterizers: their packages
-        self.results: Dict[Tuple[int, str], Set[str]] = {}  # names of what calls returned: the rasterizers' packages
         self.open = False  # names may come from where they are not seen
         defined = {node.name for node in tree.body if isinstance(node, ast.ClassDef)}
         for node in self.all(ast.Import, ast.ImportFrom):
@@ -96,19 +90,14 @@ class _File:
         for name in {SETTINGS, CLASS} - defined:
             if self.open:
                 self.bound.setdefault((0, name), {("", name)})
-        named = {name for node in self.nodes for name in _named(node)}
         for line in self.all(ast.Assign):
             value = line.value
             packages = set(self.made_of(value.func, CLASS, line)) if isinstance(value, ast.Call) else set()
-            is_other = isinstance(value, ast.Call) and isinstance(value.func, ast.Name) and (
-                value.func.id in defined or not self.open and value.func.id not in named)
+            called = getattr(value.func, "id", "") if isinstance(value, ast.Call) else ""
+            is_other = called in defined or called.startswith(CLASS)  # that is imported nowhere
             for target in filter(None, map(_path, line.targets)):
                 if packages or is_other:  # of a class of the file's own, or of none
                     self.made.setdefault(self._key(target, line), set()).update(packages)
-        for line in self.all(ast.Assign):
-            if isinstance(line.value, ast.Call):
-                for target in filter(None, map(_path, line.targets)):
-                    self.results.setdefault(self._key(target, line), set()).update(self.owners(line.value.func, line))
 
     def _note(self, node: ast.AST, scope: Scope) -> None:
         waiting: List[Tuple[ast.AST, Scope]] = [(node, scope)]
@@ -171,20 +160,6 @@ class _File:
         if made is None and path == "rasterizer" and self.has_classes:  # that a caller brought
             return [""]
         return sorted(made or ())
-
-    def kept(self, path: str, node: ast.AST) -> List[str]:
-        return sorted(self._found(self.results, path, node) or ()) if path else []
-
-
-def _named(node: Any) -> List[str]:
-    """Returns the names that a node binds."""
-    if isinstance(node, (ast.Import, ast.ImportFrom)):
-        return [alias.asname or alias.name for alias in node.names]
-    if isinstance(node, ast.Name):
-        return [node.id] * isinstance(node.ctx, ast.Store)
-    if isinstance(node, ast.alias):
-        return []
-    return [name for name in (getattr(node, "name", None), getattr(node, "arg", None)) if isinstance(name, str)]
 
 
 def _path(node: Any) -> str:

@@ -5,6 +5,7 @@ patched by an interruption, or patched with other options, and to apply it is to
 """
 from __future__ import annotations
 
+import ast
 import contextlib
 import difflib
 import importlib.util
@@ -16,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Set, Union
 
-from . import facts, kernels, run
+from . import facts, run, vendored
 from .rules import OPTIONS, SETTINGS, entries_in, import_rasterizer, rules_of, settings_blend, start
 from .runtime import STAND_INS
 from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, leftover, tree_of, unpatched
@@ -124,6 +125,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     before = {name: unpatched(data) for name, data in now.items()}
     applied = [name for name in OPTIONS if any(f"{name}.start()  {MARK}".encode() in data for data in now.values())]
     found = facts.of_checkout(before)
+    found.update(vendored.facts_of(root, facts.packages(found)))
     known, reason = facts.recognise(found)
     recorded = re.search(rf"{MARK} ([\w-]+): ".encode(), now.get(GR, b""))
     by_name = {"": known, **{one.name: one for one in reversed(TRAINERS)}}
@@ -150,7 +152,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         chosen = None
     elif GR not in now:
         reason, chosen = f"there is no {GR} in it", None
-    blends = kernels.another_blend(root, facts.packages(found)) if known and known.name != OF_AUTHORS else ""
+    blends = vendored.another_blend(root, facts.packages(found)) if known and known.name != OF_AUTHORS else ""
     if blends and not trainer:
         return Plan(root, "unknown", None, [f"{blends}: {facts.STILL}"], applied)
     if chosen is None or facts.those(found, "uses "):
@@ -209,7 +211,11 @@ def _runs(root: Path, files: Mapping[str, bytes]) -> bool:
 
 def _missing(files: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> List[str]:
     """Says what the trainer's scripts import that neither the checkout nor this environment has."""
-    needed = facts.needed_packages(facts.reached(files, [GR, *(entry.file for entry in trainer.entries)]))
+    scripts = facts.reached(files, [GR, *(entry.file for entry in trainer.entries)])
+    begin = [line for data in scripts.values() for line in tree_of(data).body]  # not in a `try`
+    needed = {name.partition(".")[0] for line in begin if isinstance(line, (ast.Import, ast.ImportFrom))
+              for name in ([alias.name for alias in line.names] if isinstance(line, ast.Import) else
+                           [line.module or ""] * (not line.level))}
     ours = {path.name for path in STAND_INS.iterdir()}  # under --modernise
     own = {part.partition(".")[0] for name in files for part in name.split("/")} | {RASTERIZER}
     missing = {name for name in needed - own if importlib.util.find_spec(name) is None}

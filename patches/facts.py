@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import itertools
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Set, Tuple
 
@@ -33,6 +33,7 @@ FOLDER = GR.partition("/")[0]
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 IMPORTS_RASTERIZER = re.compile(rb"(?m)^\s*((from|import) (\w*diff_(gauss|surfel|plane)|gsplat\b)"
                                 rb"|from (?!diff_smoe_)\w+ import .*GaussianRasteriz)")
+CALLS_BY_TEXT = re.compile(rb"\bglobals\(|(?<![.\w])eval\(|\bgetattr\((\w|\.)+, *\w")  # by a made-up name
 SPARSE_ADAM, ASKS_FOR_SPARSE_ADAM = "SparseGaussianAdam", "sparse_adam"
 BY_DEFAULT = re.compile(rb"\boptimizer_type\s*(:\s*\w+\s*)?=\s*['\"]" + ASKS_FOR_SPARSE_ADAM.encode())
 USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its rasterizer is called with",
@@ -42,8 +43,7 @@ CALLED_SO = {"depth": ("depth",), "alpha": ("alpha",), "opacity": ("alpha",), "m
              "inverse_depth": ("", "inverse_depth", "depth"), "language_feature": ("", "language_feature",
                                                                                    "feature_map")}
 SAID = {result for result, _ in WORDS} | set(CALLED_SO)
-OF_ONE = (*USES, "returns ", "may return ")  # kinds of facts that are about one rasterizer
-FOUR_COLUMNS = "means2D of four columns"
+OF_ONE = (*USES, "returns ", "keeps results")  # kinds of facts that are about one rasterizer
 STILL = "this package would not blend so; --trainer NAME takes it all the same, such as --trainer inria"
 OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their names"
 
@@ -55,9 +55,10 @@ def of_checkout(files: Mapping[str, bytes], script: str = "") -> Set[str]:
     made up while they run, every file that imports one counts.
     """
     scripts = [name for name, data in files.items() if "/" not in name and b"def training(" in data]
-    found = of_files(reached(files, [script] if script in files else [*LOOKED_AT, *scripts] * (GR in files)))
+    used = reached(files, [script] if script in files else [*LOOKED_AT, *scripts] * (GR in files))
+    found = of_files(used, used)
     others = {name: data for name, data in files.items() if IMPORTS_RASTERIZER.search(data)}
-    return found if calls_some(found) else found | of_files(others)
+    return found if calls_some(found) else found | of_files(others, files)
 
 
 def calls_some(facts: Set[str]) -> bool:
@@ -98,35 +99,35 @@ def _modules(node: ast.AST) -> List[Tuple[int, str]]:
     return []
 
 
-def needed_packages(files: Mapping[str, bytes]) -> Set[str]:
-    """Returns the packages that files import as they begin, whatever else happens."""
-    needed: Set[str] = set()
-    for data in files.values():
-        with contextlib.suppress(PatchError):
-            needed |= {module.partition(".")[0] for line in tree_of(data).body for level, module in _modules(line)
-                       if not level}
-    return needed
-
-
-def of_files(files: Mapping[str, bytes]) -> Set[str]:
+def of_files(files: Mapping[str, bytes], callers_of: Mapping[str, bytes]) -> Set[str]:
     """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "returns color, radii".
 
-    files: those of a checkout, by name. One that is not Python shows nothing: a rule will say so.
+    files: those of a checkout, by name. One that is not Python shows nothing: a rule will say so. callers_of: the files
+    that may call what is in them; a function that nothing names shows nothing.
     """
-    return set().union(*_of_each(files).values())
+    return set().union(*_of_each(files, callers_of).values())
 
 
 def importers(files: Mapping[str, bytes]) -> List[str]:
     """Returns the files that import a rasterizer, of whatever kind."""
-    return [name for name, facts in _of_each(files).items() if calls_some(facts)]
+    return [name for name, facts in _of_each(files, files).items() if calls_some(facts)]
 
 
-def _of_each(files: Mapping[str, bytes]) -> Dict[str, Set[str]]:
+def _without_dead(tree: ast.Module, words: Mapping[bytes, int]) -> ast.Module:
+    """Returns a file without the functions that are named once, where they begin."""
+    tree.body = [line for line in tree.body if not isinstance(line, ast.FunctionDef)
+                 or line.decorator_list or words[line.name.encode()] > 1]
+    return tree
+
+
+def _of_each(files: Mapping[str, bytes], callers_of: Mapping[str, bytes]) -> Dict[str, Set[str]]:
+    by_text = any(map(CALLS_BY_TEXT.search, callers_of.values()))
+    words = Counter(word for data in callers_of.values() for word in re.findall(rb"\w+", data) * (1 + by_text))
     local = {name.partition("/")[0].partition(".")[0] for name in files}
     facts: Dict[str, Set[str]] = {}
     for file, data in files.items():
         try:
-            tree = tree_of(data)
+            tree = _without_dead(tree_of(data), words)
         except PatchError:
             continue
         nodes = list(ast.walk(tree))
@@ -142,19 +143,9 @@ def _of_each(files: Mapping[str, bytes]) -> Dict[str, Set[str]]:
                 shown.add("defines " + node.name)
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
                 shown.add("reads invdepthmap")
-            elif isinstance(node, ast.Assign) and _has_four_columns(node):
-                shown.add(FOUR_COLUMNS)
             elif isinstance(node, ast.Call):
                 shown.add(f"calls {callers.last_name(node.func)}")
     return facts
-
-
-def _has_four_columns(node: ast.Assign) -> bool:
-    """Whether it makes the points on the screen with two columns more, for sums of absolute gradients (AbsGS)."""
-    shapes = (one.elts[-1] if isinstance(one, ast.Tuple) else one for call in ast.walk(node.value)
-              if isinstance(call, ast.Call) and getattr(call.func, "attr", "") == "zeros" for one in call.args[-1:])
-    return bool(re.search("screenspace|viewspace|means2D", getattr(node.targets[0], "id", ""))
-                and any(getattr(size, "value", None) == 4 for size in shapes))
 
 
 def _of_import(node: Any, may_fail: bool, later: bool, local: Set[str]) -> Iterator[str]:
@@ -215,20 +206,18 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     if foreign:
         return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
     if "from " + OF_GSPLAT in facts:
-        strange = sorted(those(facts, "passes ") - arguments_of_gsplat())
+        strange = sorted(those(facts, "passes ") - {*contracts.GSPLAT, *contracts.OF_LATER_GSPLAT})
         if strange:
             return None, f"it calls gsplat's rasterization with {', '.join(strange)}, which this package's has not"
         beside, reason = contract_of(facts - {"from " + OF_GSPLAT})
         is_beside = not facts.isdisjoint("imports " + name for name in NAMES)
         return (None, reason) if is_beside and not beside else (contracts.contract_of(OF_GSPLAT), "")
-    if facts.isdisjoint("imports " + name for name in NAMES):
-        others = [contract for name, contract in MODULES.items() if "from " + name in facts]
-        called, later = (sorted(those(facts, kind)) for kind in ("calls gsplat's ", "may use "))
-        instead = f"; it calls {', '.join(called)}" if called else ""
-        return (others[0], "") if others else (None, f"it imports gsplat and does not call its rasterization{instead}"
-                                               if "has gsplat" in facts else f"it imports {', '.join(later)}, another "
-                                               "rasterizer, and none that is known" if later else
-                                               f"nothing imports {NAMES[0]} from {RASTERIZER} or {INTEGRATIONS}")
+    others = [contract for name, contract in MODULES.items() if "from " + name in facts]
+    if facts.isdisjoint("imports " + name for name in NAMES) and not others:
+        called, later = (", ".join(sorted(those(facts, kind))) for kind in ("calls gsplat's ", "may use "))
+        return None, ("it imports gsplat and does not call its rasterization" + f"; it calls {called}" * bool(called)
+                      if "has gsplat" in facts else f"it imports {later}, another rasterizer, and none that is known"
+                      if later else f"nothing imports {NAMES[0]} from {RASTERIZER} or {INTEGRATIONS}")
     found, reason = contracts_of(facts)
     return next(iter(found.values()), None), reason
 
@@ -254,14 +243,15 @@ def contracts_of(facts: Set[str]) -> Tuple[Dict[str, Contract], str]:
     return ({}, needed[0]) if needed else (found, "")
 
 
+def not_offered(facts: Set[str], package: str, contract: Contract) -> List[str]:
+    """Returns what is imported from a package, come what may, and a rasterizer has not."""
+    own = callers.of_package(facts, package, OF_ONE)
+    return sorted(those(own, "needs ") - {*NAMES, *contract.names})
+
+
 def blocked(facts: Set[str]) -> Set[str]:
     """Returns the packages of other rasterizers that are imported only in a branch or a function."""
     return those(facts, "may use ") | (packages(facts) - set(contracts_of(facts)[0]))
-
-
-def is_own(package: str, flavour: str) -> bool:
-    """Whether a rasterizer is what its package's name says."""
-    return package in MODULES and MODULES[package].name == flavour
 
 
 def _contract_of(package: str, facts: Set[str]) -> Tuple[Optional[Contract], str]:
@@ -272,25 +262,32 @@ def _contract_of(package: str, facts: Set[str]) -> Tuple[Optional[Contract], str
     used = {kind + name for kind in USES for name in those(facts, kind)}
     free = contracts.ordered(("color", "radii"))
     unknown = used - set().union(*map(_known, (*CONTRACTS, free)))
-    returned, perhaps = sorted(those(facts, "returns ")), sorted(those(facts, "may return "))
+    seen, brought = those(facts, "returns "), those(facts, f"brings {package}: ")
+    returned = sorted(brought if brought and all(_agree(*brought, found, facts) for found in seen) else seen)
     if unknown:
         return None, _told(unknown) + ", which no rasterizer has that is known here"
-    if package != RASTERIZER and package not in MODULES and not returned + perhaps:
+    if not returned and ("keeps results" in facts or package not in (RASTERIZER, *MODULES)):
         return None, (f"it imports {package}, and what a call returns is not seen: if it has the API of a rasterizer "
                       f"that is known here, name that one by --trainer; {OF_ALL}")
     named = [MODULES[package]] if package in MODULES else []  # its name may be one rasterizer's, and its API another's
     shown = named + [contract for contract in CONTRACTS if contract.module == RASTERIZER
-                     and (not contract.signs or facts & set(contract.signs))] * bool(returned + perhaps or not named)
+                     and (not contract.signs or facts & set(contract.signs))] * bool(returned or not named)
     fitting = [contract for contract in shown if used <= _known(contract)]
-    longest = sorted(perhaps, key=lambda found: -found.count(",")) or [""]  # the most that code takes
-    for kept, contract in itertools.product(longest, fitting):
-        if all(_fits(found, contract) for found in returned) and (not kept or _fits(kept, contract)):
-            has_columns = contract.name == "inria" and FOUR_COLUMNS in facts  # which the package's own API has not
-            return contracts.ordered(("color", "radii")) if has_columns else contract, ""
-    orders = {_order(found, facts) for found in returned or longest[:1] * bool(perhaps)}
+    for contract in fitting:
+        if all(_fits(found, contract) for found in returned):
+            return contract, ""
+    orders = {_order(found, facts) for found in returned}
     if len(orders) == 1 and None not in orders and used <= _known(free):
         return contracts.ordered(*orders), ""  # type: ignore[arg-type]
-    return None, _clash(returned or perhaps, facts, used - _known(free), (fitting or shown)[0])
+    return None, _clash(returned, facts, used - _known(free), (fitting or shown)[0])
+
+
+def _agree(brought: str, found: str, facts: Set[str]) -> bool:
+    """Whether names that callers give results can be those of the rasterizer that the checkout brings."""
+    names = [one.split(", ") for one in (brought, found)]
+    return len(names[0]) == len(names[1]) and all(
+        not meant or _meaning(name, facts) in ("", *CALLED_SO.get(meant, (meant,)))
+        for meant, name in zip((_meaning(one, facts) for one in names[0]), names[1]))
 
 
 def _clash(returned: Sequence[str], facts: Set[str], whole: Set[str], nearest: Contract) -> str:
@@ -298,36 +295,21 @@ def _clash(returned: Sequence[str], facts: Set[str], whole: Set[str], nearest: C
     found = next((found for found in returned if not _fits(found, nearest)), "")
     if not found:
         return f"{_told(whole)}, which no rasterizer has together that is known here"
-    said = (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which it "
-            f"resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
-    blind = [name for name in found.split(", ") if not _meaning(name, facts)]
-    if whole:
-        return f"{said}, and {_told(whole)}, which come only with the results of a rasterizer that is known here"
-    if blind:
-        return f"{said}; what {', '.join(blind)} {'is' if len(blind) == 1 else 'are'}, no name or argument says"
-    if len({*returned}) > 1:
-        return f"{said}; other calls return {', or '.join(f'({other})' for other in returned if other != found)}"
-    return f"{said}; a name comes twice, or color or radii are not among them"
+    blind = next((name for name in found.split(", ") if not _meaning(name, facts)), "")
+    whose = next((contract for contract in CONTRACTS if blind in contract.results), None)
+    others = " or ".join(f"({other})" for other in returned if other != found)
+    why = (f"{_told(whole)}, which come only with the results of a rasterizer that is known here" if whole else
+           f"{blind} comes only in the results of {whose.name}: {', '.join(whose.results)}" if whose else
+           f"what {blind} is, no name or argument says" if blind else f"other calls return {others}" if others else
+           "a name comes twice, or color or radii are not among them")
+    return (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which it "
+            f"resembles, returns {len(nearest.results)} ({', '.join(nearest.results)}); {why}")
 
 
 def _told(used: Set[str]) -> str:
     """Returns "its settings have X; its rasterizer is called with Y"."""
     return "; ".join(f"{text} {', '.join(sorted(those(used, kind)))}" for kind, text in USES.items()
                      if those(used, kind))
-
-
-def arguments_of_gsplat() -> Set[str]:
-    """Returns the names of what gsplat's `rasterization` may be given here.
-
-    They are read from the module's text, since importing it takes the compiled extension.
-    """
-    text = Path(contracts.__file__).with_name("gsplat.py").read_bytes()
-    for node in tree_of(text).body:
-        if isinstance(node, ast.FunctionDef) and node.name == "rasterization":
-            taken = {argument.arg for argument in node.args.args}
-        elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "OF_LATER_VERSIONS":
-            later = {key.value for key in node.value.keys}  # type: ignore[attr-defined]
-    return taken | later
 
 
 def _order(found: str, facts: Set[str]) -> Optional[Tuple[str, ...]]:

@@ -26,7 +26,7 @@ from diff_smoe_rasterization.settings import (
 )
 from dsmoe.system.children import die_with_parent
 
-from . import facts, kernels
+from . import facts, vendored
 from .runtime import RASTERIZER_VARIABLE, STAND_INS, USED_VARIABLE, WITHOUT_VARIABLE
 from .source import PatchError
 from .trainers import GR, OF_AUTHORS, RASTERIZER, TRAINER_NAMES, TRAINERS
@@ -86,7 +86,7 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     flavour, where, warnings, found = _flavour(files, trainer, script)
     flavours = _flavours(flavour, trainer, found)
     named = flavours.get(RASTERIZER, "inria")  # beside another stands Inria's
-    renamed = sorted(set(flavours) - {RASTERIZER, *(name for name in flavours if facts.is_own(name, flavours[name]))})
+    renamed = sorted(name for name, one in flavours.items() if name not in (RASTERIZER, contract_of(one).module))
     blocked = sorted(facts.those(found, "may use ") if trainer else facts.blocked(found))
     path = [str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: named,
@@ -129,7 +129,13 @@ def _flavours(flavour: str, trainer: Optional[str], found: Set[str]) -> Dict[str
     own = contract_of(flavour).module
     kept = {name: one.name for name, one in facts.MODULES.items() if name in imported and own in facts.MODULES}
     given = dict.fromkeys(sorted(imported - set(kept)) or [own], flavour if own == RASTERIZER else "inria")
-    return {**given, **kept, **{own: flavour}} if own != facts.OF_GSPLAT else {}
+    flavours = {**given, **kept, **{own: flavour}} if own != facts.OF_GSPLAT else {}
+    for name, one in flavours.items():
+        missing = facts.not_offered(found, name, contract_of(one))
+        if missing:
+            raise PatchError(f"it imports {', '.join(missing)} from {name}, which the rasterizer {one} has not; "
+                             f"--trainer {trainer} cannot help")
+    return flavours
 
 
 def write_rasterizers(folder: Path, packages: str) -> None:
@@ -164,12 +170,13 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
         inside = script is not None and folder in script.parents
         name = script.relative_to(folder).as_posix() if script and inside else ""
         found = facts.of_checkout(texts, name)
+        found.update(vendored.facts_of(folder, facts.packages(found)))
         everything |= found
         if facts.PATCHED in found:
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
         known, reason = facts.recognise(found)
-        blends = kernels.another_blend(folder, facts.packages(found)) if known and known.name != OF_AUTHORS else ""
+        blends = vendored.another_blend(folder, facts.packages(found)) if known and known.name != OF_AUTHORS else ""
         if blends and not trainer:
             raise PatchError(f"{folder}: {blends}: {facts.STILL}")
         reasons += [f"{folder}: {blends}"] * bool(blends)

@@ -35,8 +35,6 @@ TERMS = 100  # in densify_until_iter, at least, if that has so many steps
 # A view needs a Gaussian if its removal costs more than this there: squared colours, summed over pixels.
 NEEDED_COST = 1e-3
 
-DROPS_UNNEEDED = False  # from a model, before the second step
-
 NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
 NUMBERS_AT_ONCE = 2 ** 22  # coordinates of Gaussians, each seen from every camera: 16 MB of them are in memory
 
@@ -82,7 +80,7 @@ class ImportanceStrategy(SteadyStrategy):
         count = self.options.removals
         last = config.iterations - config.batch  # the last step changes nothing
         self.removals = [min(last, round(until * (begin + (REMOVALS_END - begin) * i / count))) for i in range(count)]
-        self.drops_unneeded = is_enough and DROPS_UNNEEDED
+        self.drops_unneeded = is_enough
         interval = max(1, round(until / self.options.pace))
         self.moves_end = round(MOVES_END * until)
         self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)

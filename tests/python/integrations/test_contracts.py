@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 from types import SimpleNamespace
 
@@ -19,6 +20,8 @@ from diff_smoe_rasterization.integrations import (
     fastgs,
     feature_3dgs,
     grouping,
+    gsplat,
+    inria,
     inria_2024,
     langsplat,
     light_gaussian,
@@ -33,7 +36,14 @@ from diff_smoe_rasterization.integrations import (
     speedy_splat,
 )
 from diff_smoe_rasterization.integrations._rasterizer import classes_of
-from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES, SETTINGS, contract_of
+from diff_smoe_rasterization.integrations.contracts import (
+    CONTRACTS,
+    GSPLAT,
+    NAMES,
+    OF_LATER_GSPLAT,
+    SETTINGS,
+    contract_of,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -125,11 +135,12 @@ def test_mip_splatting_has_a_low_pass_filter_of_its_own(mode):
         rendered(mip_splatting, scene, {**given, "subpixel_offset": zeros + 0.25})
 
 
-@pytest.mark.parametrize("module, third", [(absgs, "blend_weights"), (fastgs, None), (inria_2024, None)])
+@pytest.mark.parametrize("module, third", [
+    (absgs, "blend_weights"), (fastgs, None), (inria_2024, None), (inria, None)])
 def test_two_more_columns_of_means2d(mode, module, third):
     scene, weights = scene_of(mode), random_normal((3, HEIGHT, WIDTH), 83)
     points = torch.zeros(N, 4, dtype=torch.float64, requires_grad=True)
-    color, _, sums = rendered(module, scene, {"get_flag": False} if module is fastgs else {}, means2D=points)
+    color, _, *sums = rendered(module, scene, {"get_flag": False} if module is fastgs else {}, means2D=points)
     (color * weights).sum().backward()
     expected, absolute = sums_of_absolute_gradients(scene, weights)
     assert_close(points.grad[:, 2:], absolute, TOLERANCE, "the last columns")
@@ -138,9 +149,16 @@ def test_two_more_columns_of_means2d(mode, module, third):
     assert_close(points.grad[:, :2], signed.grad[:, :2], TOLERANCE, "the first columns")
     if third:
         splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
-        assert_close(sums, getattr(splats.contributions(torch.ones_like(color[0]).detach()), third), TOLERANCE, third)
+        found = splats.contributions(torch.ones_like(color[0]).detach())
+        assert_close(sums[0], getattr(found, third), TOLERANCE, third)
     with torch.no_grad():  # as trainers render test views
         assert_close(rendered(module, scene, means2D=points + 0)[0], color, TOLERANCE, "color")
+
+
+def test_the_arguments_of_gsplat_are_those_of_its_contract():
+    """`dsmoe run` compares a trainer's call with them, and the extension need not be there for that."""
+    taken = inspect.signature(gsplat.rasterization).parameters
+    assert [*taken] == [*GSPLAT, "others"] and not {*OF_LATER_GSPLAT} & {*GSPLAT}
 
 
 def test_mcmc_says_what_is_used_and_relocates():

@@ -36,7 +36,7 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
     result = python("-m", "dsmoe", *RUN, "--background-gate", "0.25", "--", sys.executable,
                     checkout / "parent.py", *WORDS, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert result.status == 7, result.err
-    assert result.out.splitlines() == [f"diff_smoe_rasterization.rasterizer smoe {WORDS}"]
+    assert result.out.splitlines() == [f"diff_smoe_rasterization.integrations.inria smoe {WORDS}"]
     announced, *said = result.err.splitlines()
     words = "of this package, blend mode smoe, background gate 0.25"
     assert "3dgs-2023" in announced and "will be inria " + words in announced
@@ -233,7 +233,8 @@ def test_settings_and_results_combine_freely(flavour, tmp_path, monkeypatch):
 
 
 IN_FUNCTION = ("def render_{2}():\n    from {0} import GaussianRasterizationSettings as Settings, GaussianRasterizer\n"
-               "    rasterizer = GaussianRasterizer(Settings(bg=1, {3}))\n    {1} = rasterizer(means3D=1)\n")
+               "    rasterizer = GaussianRasterizer(Settings(bg=1, {3}))\n    {1} = rasterizer(means3D=1)\n"
+               "used = render_{2}\n")
 
 
 def test_each_package_is_told_by_its_own_calls(tmp_path, monkeypatch):
@@ -242,7 +243,8 @@ def test_each_package_is_told_by_its_own_calls(tmp_path, monkeypatch):
     known = (IN_FUNCTION.format("diff_gaussian_rasterization_abs", "image, radii, depth_image", 1, "antialiasing=1")
              + IN_FUNCTION.format("diff_gaussian_rasterization", "image, radii", 2, "")
              + "class Plain: pass\ndef render_3():\n    rasterizer = Plain(1)\n    a, b = rasterizer(means3D=1)\n"
-             + "def render_4():\n    rasterizer = Missing(1)\n    a, b, c = rasterizer(means3D=1, own=2)\n")
+             + "used = render_3\ndef render_4():\n    rasterizer = GaussianRasterizerOfNone(1)\n"
+             + "    a, b, c = rasterizer(means3D=1, own=2)\nused = render_4\n")
     monkeypatch.chdir(make(tmp_path, {GR: known}))
     made, lines = run.prepare(*words)
     assert made["DSMOE_RUN_PACKAGES"].split(os.pathsep) == [
@@ -277,7 +279,7 @@ RENAMED = ("from {0} import GaussianRasterizationSettings as Settings, GaussianR
     ("diff_gauss_own", "rendered_depth, opacity, render, radii", "depth,alpha,color,radii"),
     ("diff_gaussian_rasterization", "inv_depth, image, radii", "inverse_depth,color,radii"),
     ("diff_gaussian_rasterization_w_depth", "out", "what a call returns is not seen"),
-    ("diff_gauss", "image, depth, normal, alpha, radii, extra", "what normal, extra are, no name or argument says"),
+    ("diff_gauss", "image, depth, normal, alpha, radii, extra", "what normal is, no name or argument says"),
     ("diff_gaussian_rasterization", "depth, image, radii, is_used", "depth,color,radii,is_used"),
     ("diff_gaussian_rasterization", "image, radii, depth_normal", "what depth_normal is, no name"),
     ("diff_gaussian_rasterization", "image, radii, accum_max_count", "what accum_max_count is, no name"),
@@ -300,17 +302,82 @@ def test_another_name_or_order_is_told_by_what_callers_show(name, results, flavo
     refused(tmp_path, "for which there is no patch: type `dsmoe run" if is_renamed or is_ordered else "unpatchable")
 
 
-def test_results_that_are_kept_before_they_are_unpacked_count(tmp_path, monkeypatch):
-    """Code that looks how many there are gets the most that are known."""
-    text = RENAMED.format("diff_gaussian_rasterization", "out").split("out = ")[0]
-    own = "def render(draw):\n    out = draw(means3D=1)\n    image, radii, depth, alpha = out\n"
-    monkeypatch.chdir(make(tmp_path, {GR: text + own}))
+OWN = "submodules/own/diff_gaussian_rasterization/__init__.py"
+SOURCE = """import torch
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means3D, raster_settings):
+        return {0}
+    @staticmethod
+    def backward(ctx, *gradients):
+        return None, None
+class GaussianRasterizer(torch.nn.Module):
+    def forward(self, means3D):
+        return {1}
+"""
+
+
+@pytest.mark.parametrize("called, returned, passed, flavour", [
+    # What callers do not unpack, or name by words that say nothing.
+    ("out", "color, radii, depth, alpha", "_Rasterize.apply(means3D)", "depth_alpha"),
+    ("a, b, c", "color, radii, invdepths", "_Rasterize.apply(means3D)", "inria_2024"),
+    ("image, depths, _, radii", "color, depth, alpha, radii", "_Rasterize.apply(means3D)", "color,depth,alpha,radii"),
+    # What contradicts callers, is changed on its way, or has no names, counts as if it were not there.
+    ("image, radii, depth, alpha", "color, radii, alpha, depth", "_Rasterize.apply(means3D)", "depth_alpha"),
+    ("image, radii", "color, radii, depth", "_Rasterize.apply(means3D)", "inria"),
+    ("out", "color, radii, depth", "_Rasterize.apply(means3D)[:2]", "what a call returns is not seen"),
+    ("out", "color, torch.ones(1)", "_Rasterize.apply(means3D)", "what a call returns is not seen"),
+    ("out", "outputs", "_Rasterize.apply(means3D)", "what a call returns is not seen"),
+    ("image, radii, depth, alpha", "color, radii, depth, normal", "_Rasterize.apply(means3D)", "what normal is, no")])
+def test_a_rasterizer_in_the_checkout_says_what_it_returns(called, returned, passed, flavour, tmp_path, monkeypatch):
+    text = RENAMED.format("diff_gaussian_rasterization", called).replace("bg=1", "bg=1, antialiasing=1") if (
+        "inv" in returned) else RENAMED.format("diff_gaussian_rasterization", called)
+    monkeypatch.chdir(make(tmp_path, {GR: text, OWN: SOURCE.format(returned, passed)}))
     words = [sys.executable, "train.py"], "smoe", None, environment()
-    assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == "depth_alpha"
-    more = "    if len(out) == 2:\n        image, radii = out\n"
-    for made, flavour in ((own, "depth_alpha"), (own.replace("radii, depth", "radii, normals, depth"), "inria")):
-        make(tmp_path, {GR: text + made + more})
+    if " " in flavour:
+        with pytest.raises(patches.PatchError, match=flavour):
+            run.prepare(*words)
+    else:
         assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == flavour
+
+
+def test_copies_of_a_rasterizer_that_differ_say_nothing(tmp_path, monkeypatch):
+    other = OWN.replace("own", "other")
+    text = RENAMED.format("diff_gaussian_rasterization", "out")
+    monkeypatch.chdir(make(tmp_path, {
+        GR: text, OWN: SOURCE.format("color, radii", "f()"), other: SOURCE.format("color, radii, depth", "f()")}))
+    with pytest.raises(patches.PatchError, match="what a call returns is not seen"):
+        run.prepare([sys.executable, "train.py"], "smoe", None, environment())
+
+
+def test_a_function_that_nothing_names_says_nothing(tmp_path, monkeypatch):
+    """Unless functions are called by texts that are made up."""
+    dead = "def render_masks():\n    import diff_surfel_rasterization\n    a, b, c = rasterizer(means3D=1, masks=2)\n"
+    text = RENAMED.format("diff_gaussian_rasterization", "image, radii") + dead
+    monkeypatch.chdir(make(tmp_path, {GR: text}))
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    assert run.prepare(*words)[0]["DSMOE_RUN_PACKAGES"] == "diff_gaussian_rasterization=inria"
+    for caller in ("from gaussian_renderer import render_masks", "getattr(gaussian_renderer, name)()",
+                   "globals()['render_' + kind]()"):
+        make(tmp_path, {GR: text, "train.py": f"import gaussian_renderer\n{caller}\ndef training(): pass\n"})
+        with pytest.raises(patches.PatchError, match="called with masks, which no rasterizer has"):
+            run.prepare(*words)
+
+
+def test_what_a_checkout_imports_is_compared_with_the_trainer_that_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(make(tmp_path, {GR: "from diff_gaussian_rasterization import compute_relocation\n" + RENDERER}))
+    words = [sys.executable, "train.py"], "smoe"
+    with pytest.raises(patches.PatchError, match="imports compute_relocation from diff_.*, which the rasterizer inria "
+                                                 "has not; --trainer inria cannot help"):
+        run.prepare(*words, "inria", environment())
+    assert run.prepare(*words, "mcmc", environment())[0]["DSMOE_RASTERIZER"] == "mcmc"
+
+
+def test_a_word_of_a_known_rasterizer_is_told_by_that(tmp_path, monkeypatch):
+    text = RENAMED.format("diff_gaussian_rasterization", "image, radii, kernel_times, depth")
+    monkeypatch.chdir(make(tmp_path, {GR: text}))
+    with pytest.raises(patches.PatchError, match="kernel_times comes only in the results of speedy_splat: color"):
+        run.prepare([sys.executable, "train.py"], "smoe", None, environment())
 
 
 def test_a_renamed_rasterizer_with_results_in_another_order_renders(tmp_path, python):
@@ -331,15 +398,6 @@ print(list(color.shape), [round(one[0, 4, 4].item(), 1) for one in (depth, media
                     cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert result.out == "[3, 8, 8] [2.0, 2.0, 1.0] torch.int32\n", result.err
     assert contents(tmp_path) == before
-
-
-@pytest.mark.parametrize("columns, flavour", [("zeros_like(pc.xyz)", "inria"), ("zeros(pc.xyz.shape[0], 3)", "inria"),
-                                              ("zeros((pc.xyz.shape[0], 4), requires_grad=True) + 0", "color,radii")])
-def test_points_of_four_columns_need_what_has_absolute_gradients(columns, flavour, tmp_path, monkeypatch):
-    """AbsGS's rule in a fork of Inria's, whose own module takes three."""
-    text = RENAMED.format("diff_gaussian_rasterization", "image, radii")
-    monkeypatch.chdir(make(tmp_path, {GR: f"{text}screenspace_points = torch.{columns}\n"}))
-    assert run.prepare([sys.executable, "train.py"], "smoe", None, environment())[0]["DSMOE_RASTERIZER"] == flavour
 
 
 @pytest.mark.parametrize("like_3dgs", [True, False])
@@ -395,6 +453,7 @@ def test_mini_splatting_has_two_rasterizers_and_a_method(tmp_path, monkeypatch):
            "    {1} = draw(means3D=1)\n")
     both = RENDERER + "def render_1():\n" + own.format("diff_gaussian_rasterization", "image, radii") + \
         "def render_2():\n" + own.format("diff_gaussian_rasterization_ms", "image, radii, weights, count, max_count")
+    both = "used = 'render_1, render_2'\n" + both
     monkeypatch.chdir(make(tmp_path, {GR: both + "    draw.render_depth(means3D=1)\n"}))
     words = [sys.executable, "train.py"], "smoe", None, environment()
     assert "diff_gaussian_rasterization_ms will be mini_splatting" in run.prepare(*words)[1][0]
@@ -473,7 +532,7 @@ INRIA_2024 = ("from diff_gaussian_rasterization import GaussianRasterizationSett
     ("import gsplat as g", "g.rendering.rasterization(means=1)", ""),
     ("from gsplat.rendering import rasterization as draw", "fn = draw", ""),
     ("from gsplat import rasterization", "rasterization(means=1, colors0=2)", "rasterization with colors0, which"),
-    ("def later():\n    from gsplat.cuda._torch_impl import quat_to_rotmat", "quat_to_rotmat(1)",
+    ("def later():\n    from gsplat.cuda._torch_impl import quat_to_rotmat\nlater()", "quat_to_rotmat(1)",
      "it imports gsplat and does not call its rasterization"),
     ("import gsplat", "gsplat.rasterization_2dgs(means=1)",
      "does not call its rasterization; it calls rasterization_2dgs"),

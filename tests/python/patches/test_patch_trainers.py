@@ -46,14 +46,15 @@ def test_recognised_by_structure_alone():
 
 ONE_LINE = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
 BY_NAME = "    draw = GaussianRasterizer(raster_settings=settings)\n    {} = draw(means3D=pc.get_xyz)\n"
-DEPTH_LOSS = TRAIN + "\n\ndef depth_loss(view, depth):\n    return abs(depth - view.invdepthmap).mean()\n"
+DEPTH_LOSS = TRAIN + ("\n\ndef depth_loss(view, depth):\n    return abs(depth - view.invdepthmap).mean()\n\n\n"
+                      "used = depth_loss\n")
 SPARSE_ADAM = "from diff_gaussian_rasterization import SparseGaussianAdam\n"
 ANTIALIASED = RENDERER.replace("prefiltered=False,", "antialiasing=pipe.antialiasing, prefiltered=False,")
 
 
 @pytest.mark.parametrize("renderer, results, train, trainer", [
-    (RENDERER, "color, radii", TRAIN, "3dgs-2023"), (RENDERER, "color, *rest", TRAIN, "3dgs-2023"),
-    (RENDERER, "everything", TRAIN, "3dgs-2023"),
+    (RENDERER, "color, radii", TRAIN, "3dgs-2023"), (RENDERER, "color, *rest", TRAIN, None),
+    (RENDERER, "everything", TRAIN, None),
     (RENDERER, "color, radii, depth", DEPTH_LOSS, "3dgs-2024"),  # of August
     (ANTIALIASED, "color, radii, depth", TRAIN, "3dgs-2024"),  # of September
     (RENDERER, "color, radii, depth", TRAIN, "3dgs-depth"),  # of 4DGaussians and others
@@ -72,6 +73,7 @@ def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, res
     run = "for which there is no patch: type `dsmoe run --blend-mode smoe -- python train.py ...`"
     said = {"kernel_size": f"its rasterizer is mip_splatting, {run}",
             "inv_depth": f"its rasterizer is color,radii,inverse_depth, {run}",
+            "everything": "what a call returns is not seen", "*rest": "what a call returns is not seen",
             "blur": "its GaussianRasterizationSettings have blur, which no rasterizer has that is known here"}
     runs = "kernel_size" in renderer or "inv_depth" in renderer
     refused(tmp_path, "supported" if runs else "unknown", next((said[name] for name in said if name in renderer),
@@ -84,6 +86,9 @@ def prefilter_voxel(camera, pc, pipe):
     settings = GaussianRasterizationSettings(
         bg=None, debug=pipe.debug)
     return GaussianRasterizer(raster_settings=settings).visible_filter(pc.get_xyz)
+
+
+used = prefilter_voxel
 """
 RENDERING = "\n\ndef render_sets(dataset, iteration, pipeline):\n    return render(None, None, pipeline, None)\n"
 COMPRESS = TRAIN.replace("training(dataset, opt, pipe,", "run_vq(model_params, opt, pipeline_params,").replace(
@@ -124,7 +129,7 @@ AUTHORS = {
         "from gaussian_renderer import render\nfrom scene import Scene\n\n\n"
         "def images_to_video(folder, path, fps=30):\n    pass\n\n\n"
         "def render_sets(dataset, iteration, pipeline, skip_train, skip_test, separate_sh):\n"
-        "    images_to_video('', '')\n    return render(None, None, pipeline, None)\n"),
+        "    images_to_video('', '')\n    return render(None, None, pipeline, None)\n\n\nused = render_sets\n"),
     "generate_pose.py": f"try:\n    {SPARSE_ADAM}except:\n    pass\nfrom gaussian_renderer import render\n"}
 
 
@@ -193,7 +198,8 @@ def test_a_fork_that_no_contract_fits_is_patched_with_a_warning_and_one_of_anoth
     assert "--trainer 3dgs-2023: its rasterizer is called with degrees" in note
     private = RENDERER.replace("import math", "from diff_gaussian_rasterization._C import kmeans_cuda\nimport math")
     refused(make(tmp_path / "private", {GR: private}), "it imports diff_gaussian_rasterization._C.kmeans_cuda, which")
-    both = RENDERER + "\n\ndef render_imp():\n    from diff_gaussian_rasterization_gof import GaussianRasterizer\n"
+    both = RENDERER + ("\n\ndef render_imp():\n    from diff_gaussian_rasterization_gof import GaussianRasterizer\n"
+                       "used = render_imp\n")
     beside = {"gaussian_renderer/b.py": both, "train.py": "from gaussian_renderer import b\n" + TRAIN}
     refused(make(tmp_path / "beside", beside), "it imports diff_gaussian_rasterization_gof too, another rasterizer",
             "type `dsmoe run --blend-mode smoe -- python train.py ...`")

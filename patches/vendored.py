@@ -1,4 +1,4 @@
-"""What the forward kernels in a checkout blend, if they are there: read as text, never compiled.
+"""What the rasterizers in a checkout return and blend, if their sources are there: read as text, never run.
 
 In Inria's a Gaussian has alpha = min(0.99, opacity * exp(power)), with power a quadratic form. It adds
 colour * alpha * T to a pixel, and the background adds T times its own. A kernel with another of these statements blends
@@ -6,9 +6,13 @@ something else.
 """
 from __future__ import annotations
 
+import ast
+import contextlib
 import re
 from pathlib import Path
-from typing import Collection, List
+from typing import Any, Collection, Dict, Iterator, List
+
+from .source import PatchError, tree_of
 
 COMMENTS = re.compile(r"//[^\n]*|/\*.*?\*/", re.S)
 NAME, SUBSCRIPTS = r"[\w.>-]+", re.compile(r"\[[^\[\]]*\]")
@@ -49,3 +53,30 @@ def _kernels(root: Path, packages: Collection[str]) -> List[Path]:
     setups = [path for pattern in ("*/setup.py", "*/*/setup.py", "*/*/*/setup.py") for path in root.glob(pattern)]
     return sorted({path for setup in setups if named.search(setup.read_text(errors="replace"))
                    for path in setup.parent.glob("cuda_rasterizer/forward.cu")})
+
+
+def facts_of(root: Path, packages: Collection[str]) -> Iterator[str]:
+    """Yields "brings PACKAGE: color, radii" for what the autograd function of a package returns, if all copies agree.
+
+    Its names are closer to the meaning than those of callers, and say what a caller does not unpack.
+    """
+    for package in packages:
+        found = {_returned(path) for folders in ("*/", "*/*/", "*/*/*/")
+                 for path in root.glob(f"{folders}{package}/__init__.py")}
+        yield from (f"brings {package}: {names}" for names in found if names and len(found) == 1)
+
+
+def _returned(path: Path) -> str:
+    """Returns the names that GaussianRasterizer passes on as they are, "" where it does not, or they have no names."""
+    results: Dict[str, List[Any]] = {}
+    with contextlib.suppress(PatchError):
+        for node in tree_of(path.read_bytes()).body:
+            is_autograd = any(getattr(base, "attr", "") == "Function" for base in getattr(node, "bases", ()))
+            for method in getattr(node, "body", ()) if isinstance(node, ast.ClassDef) else ():
+                if getattr(method, "name", "") == "forward":
+                    results.setdefault("Function" if is_autograd else node.name, []).extend(
+                        line.value for line in ast.walk(method) if isinstance(line, ast.Return))
+    made, passed = results.get("Function", []), results.get("GaussianRasterizer", [])
+    is_seen = len(made) == 1 and isinstance(made[0], ast.Tuple) and all(isinstance(one, ast.Call) for one in passed)
+    names = [getattr(one, "id", "") for one in made[0].elts] if is_seen else []
+    return ", ".join(names) * all(names)
