@@ -208,7 +208,7 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
-    if config.strategy == STRATEGY and not arguments.resume and "budget" not in given_options(arguments):
+    if config.strategy == STRATEGY and not arguments.resume and not getattr(arguments, "budget", 0):
         whose = "that of the model" if config.init else "chosen for the scene"
         print(f"note: that number is {whose}; --budget N makes more or fewer, and --strategy 3dgs is the recipe of "
               "3DGS")

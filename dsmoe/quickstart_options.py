@@ -38,7 +38,8 @@ def parse(argv: Optional[List[str]] = None) -> argparse.Namespace:
 
 def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
     """The options of the training that are given."""
-    return {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
+    return {name: value for name, value in vars(arguments).items()
+            if name not in ("scene", "output", "quiet") and (name, value) != ("budget", 0)}  # which is none
 
 
 def unchecked_config(folder: str, options: Dict[str, Any]) -> TrainConfig:

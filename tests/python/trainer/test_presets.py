@@ -62,10 +62,11 @@ def test_best_scales_all_milestones_and_takes_given_options(tiny_scene, tmp_path
     assert (config.strategy_options, config.budget) == ("views=255", 70)
 
 
-def test_without_options_importance_takes_a_number_that_the_scene_says(tiny_scene, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("none", [[], ["--budget", "0"]])
+def test_without_options_importance_takes_a_number_that_the_scene_says(tiny_scene, tmp_path, capsys, monkeypatch, none):
     monkeypatch.setitem(NUMBERS, "cpu", Numbers(2, 10, 1000, 20, 1000))
     output, words = str(tmp_path / "out"), ["--iterations", "30", "--quiet"]
-    assert main(["train", tiny_scene, "-o", output, *words]) == 0
+    assert main(["train", tiny_scene, "-o", output, *words, *none]) == 0
     said, config = capsys.readouterr().out, TrainConfig.load(output)
     assert "strategy importance to 288 Gaussians" in said, "two for each of the 144 points"
     assert "--budget N makes more or fewer, and --strategy 3dgs is the recipe of 3DGS" in said

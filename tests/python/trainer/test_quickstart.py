@@ -16,6 +16,7 @@ from PIL import Image
 from diff_smoe_rasterization.io import read_colmap, read_gaussians
 from dsmoe import cli, quickstart, short_run
 from dsmoe.presets import FAST
+from dsmoe.quickstart_options import check, given_options, parse
 from dsmoe.results.pictures import MARGIN, comparison, evenly_spaced, window_of_differences
 from dsmoe.system import files
 
@@ -138,6 +139,11 @@ def test_given_options_win_over_chosen_ones(tiny_scene):
     given = quickstart.choose_options(tiny_scene, {"iterations": 600, "densify_until_iter": 100, "strategy": "3dgs"})
     assert (given.iterations, given.densify_until_iter, given.opacity_reset_interval) == (600, 100, 60)
     assert given.strategy == "3dgs"
+
+
+def test_a_budget_of_none_is_chosen(tiny_scene):
+    assert given_options(parse([tiny_scene, "--budget", "0", "--seed", "4"])) == {"seed": 4}
+    assert check([tiny_scene, "--budget", "0"]) == 0
 
 
 def test_large_scenes_are_reduced_and_told(monkeypatch, tiny_scene, capsys):
