@@ -22,7 +22,11 @@ def check_early(arguments: argparse.Namespace) -> None:
         check_photos(arguments.photos)
     elif command == "train" and not arguments.resume and scene and getattr(arguments, "output", ""):
         check_scene(scene)
+        if getattr(arguments, "init", ""):
+            check_model(arguments.init)
         _check_options(arguments)
+    elif command == "simplify":
+        check_model(arguments.model)
     elif command == "eval":
         TrainConfig.load(arguments.output)
     elif command in ("render", "export", "view"):
@@ -36,7 +40,7 @@ def check_early(arguments: argparse.Namespace) -> None:
             check_orbit(arguments.frames, arguments.fps)
         if command == "export" and arguments.output:
             check_output(arguments.output, arguments.overwrite)
-    if command in ("eval", "render", "export", "view") and scene:
+    if command in ("eval", "render", "export", "view", "simplify") and scene:
         check_scene(scene)
 
 
@@ -57,6 +61,13 @@ def check_source(source: str, besides: str = "") -> None:
     if not is_folder(source) and not is_file(source):
         raise TrainerError(f"{source}: no such file or folder; name the output folder of `dsmoe train`, or a .ply"
                            + (f" {besides}" if besides else ""))
+
+
+def check_model(source: str) -> None:
+    """Raises TrainerError if there is no such file or folder."""
+    if not is_file(source) and not is_folder(source):
+        raise TrainerError(f"{source}: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of "
+                           "`dsmoe train` or a model folder of 3DGS")
 
 
 def check_scene(folder: str) -> None:

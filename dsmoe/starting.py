@@ -15,6 +15,7 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES
 
 from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of
+from .early import check_model
 from .errors import ConfigError, TrainerError
 from .export.glb import glb_gaussians
 from .export.splat import splat_gaussians
@@ -124,9 +125,7 @@ def find_model(source: str) -> Found:
     """The model in a file, an output folder of `dsmoe train` or a model folder of 3DGS. Raises TrainerError."""
     if is_file(source):
         return Found(source)
-    if not is_folder(source):
-        raise TrainerError(f"{source}: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of "
-                           "`dsmoe train` or a model folder of 3DGS")
+    check_model(source)
     if holds_run(source):
         return _found_run(source)
     path = latest_model(source)
