@@ -8,7 +8,15 @@ from .checks import check_tensor, refuse_device
 from .extension import BACKENDS
 from .learned_gate import gate_of
 from .raw_values import look_for_raw_values
-from .settings import BLEND_MODES, FEATURE_OUTPUTS, OUTPUTS, Rendering, resolve_blend, resolve_faint_below
+from .settings import (
+    BLEND_MODES,
+    FEATURE_OUTPUTS,
+    OUTPUTS,
+    Rendering,
+    resolve_blend,
+    resolve_faint_below,
+    resolve_lens,
+)
 
 
 def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
@@ -49,7 +57,9 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
             if not _fits(kind, value):
                 raise ValueError(f"{function}: {name} is {value!r}; it must be {_KINDS[kind]}")
     faint_below = resolve_faint_below(blend_mode, settings.faint_below)
-    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), *[name in outputs for name in FEATURE_OUTPUTS]]
+    model, lens = resolve_lens(settings)
+    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens,
+                *[name in outputs for name in FEATURE_OUTPUTS]]
     for place, value in zip(_COMPUTED_OPTIONS.values(), computed):
         options.insert(place, value)
     return options
@@ -72,7 +82,8 @@ _WHOLE_LIMIT = 2**63
 # for_backward, which is the last one.
 assert list(OPTIONS)[-1] == "for_backward"
 _COMPUTED_OPTIONS = {name: list(OPTIONS).index(name)
-                     for name in ("faint_below", "fixed_background_gate", "blend_mode", *FEATURE_OUTPUTS)}
+                     for name in ("faint_below", "fixed_background_gate", "blend_mode", "camera_model", "lens",
+                                  *FEATURE_OUTPUTS)}
 assert list(_COMPUTED_OPTIONS.values()) == sorted(_COMPUTED_OPTIONS.values())  # they are inserted in this order
 _SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
 _WHOLE_OPTIONS = [place for place, (_, kind) in enumerate(_SETTING_OPTIONS) if kind is int]

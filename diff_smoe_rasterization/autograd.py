@@ -21,7 +21,7 @@ _CAN_REGISTER = hasattr(torch.library, "register_autograd")
 INPUTS, IMAGES = _core.inputs, _core.images
 """The names of the op's tensors, and of the images among its results. csrc/torch/fields.h lists them."""
 
-_PYTHON_TYPES = {"SymInt": int, "int": int, "float": float, "bool": bool}
+_PYTHON_TYPES = {"SymInt": int, "int": int, "float": float, "float[]": list, "bool": bool}
 OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _core.options.items()}
 """The op's other arguments with their types, in order: what `csrc/torch/fields.h` lists."""
 
@@ -140,7 +140,8 @@ def _backward(ctx, *gradients):
     inputs, images, saved = kept[:count], kept[count:count + _NUM_IMAGES], kept[count + _NUM_IMAGES:]
     by_input = _input_gradients(ctx, list(ctx.needs_input_grad[:_NUM_INPUTS]), gradients, inputs, images, saved,
                                 _OPS.rasterize_backward)
-    return (*by_input, *(None for _ in OPTIONS))
+    # torch wants a gradient of the structure of each argument: of a list a list.
+    return (*by_input, *([None] * len(option) if isinstance(option, (list, tuple)) else None for option in ctx.options))
 
 
 def _refuse_second_derivative(ctx, *gradients):
@@ -237,7 +238,7 @@ def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
     return _fake_gradients(inputs, present, others[-1])
 
 
-def _fake_mark_visible(positions, viewmatrix, near):
+def _fake_mark_visible(positions, viewmatrix, near, camera_model=0):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
 
 

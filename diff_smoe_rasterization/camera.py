@@ -1,11 +1,12 @@
-"""From a calibrated pinhole camera to the settings of a rendering."""
+"""From a calibrated camera to the settings of a rendering."""
 from __future__ import annotations
 
-from typing import Any, Optional
+import math
+from typing import Any, Optional, Sequence
 
 import torch
 
-from .settings import GaussianRasterizationSettings, resolve_blend_mode
+from .settings import GaussianRasterizationSettings, resolve_blend_mode, resolve_lens
 
 # Clip range of the projection matrix. Nothing reads clip z (culling uses view depth), so it only has to be finite.
 CLIP_NEAR = 0.01
@@ -14,25 +15,33 @@ CLIP_FAR = 100.0
 
 def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Optional[torch.Tensor] = None,
                          sh_degree: int = 3, scale_modifier: float = 1.0, dtype: Optional[torch.dtype] = None,
+                         camera_model: str = "pinhole", distortion: Sequence[float] = (),
                          **options: Any) -> GaussianRasterizationSettings:
-    """The settings of a pinhole camera, transposed matrices included.
+    """The settings of a camera, transposed matrices included.
 
     Args:
         K: [3, 3] intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. As in COLMAP, the centre of the top left
-            pixel is (0.5, 0.5); if it is (0, 0), as in OpenCV, add 0.5 to cx and cy.
+            pixel is (0.5, 0.5); if it is (0, 0), as in OpenCV, add 0.5 to cx and cy. Of "orthographic" fx and fy are
+            pixels by unit of length; of "equirectangular" None, as the image's size says all.
         R, t: [3, 3] and [3], world to view: x_view = R x_world + t, with x right, y down, z forward.
         width, height: of the image in pixels.
         bg: [C] background colour; black where it is None. The matrices are on its device.
-        dtype: of the matrices, by default that of bg, else float32.
+        dtype: of the matrices, by default bg's, else float32.
+        camera_model, distortion: the lens, and its numbers, as CAMERA_MODELS has them.
         options: further fields of the settings, such as blend_mode.
     K, R and t are tensors, arrays or lists. The matrices have gradients with respect to R, t and, in the projection, K.
+    A lens has no gradient.
 
     Returns: GaussianRasterizationSettings. Raises ValueError if a shape does not fit, K has skew or focal lengths
-    that are not positive, R is not a rotation, or a blend mode is not known.
+    that are not positive, R is not a rotation, or a blend mode or a camera model is not known.
     """
     resolve_blend_mode(options.get("blend_mode"))  # refused if it is given, not at the first rendering
     dtype = dtype or (torch.float32 if bg is None else bg.dtype)
     bg = torch.zeros(3, dtype=dtype) if bg is None else bg
+    if camera_model == "equirectangular":
+        if K is not None:
+            raise ValueError("settings_from_camera: K is given; an equirectangular camera has none, so it must be None")
+        K = [[width / (2 * math.pi), 0, width / 2], [0, height / math.pi, height / 2], [0, 0, 1]]
     device = R.device if isinstance(R, torch.Tensor) else "cpu"  # computed there: elsewhere to check values would wait
     K, R, t = (torch.as_tensor(value, dtype=torch.float64, device=device) for value in (K, R, t))
     for name, value, shape in (("K", K, [3, 3]), ("R", R, [3, 3]), ("t", t, [3])):
@@ -51,10 +60,13 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
     view = torch.cat([torch.cat([R, t[:, None]], dim=1), last])
     view, projection, center = (matrix.contiguous().to(bg.device, dtype)
                                 for matrix in (view.T, (clip_matrix(K, width, height) @ view).T, -R.T @ t))
-    return GaussianRasterizationSettings(
+    settings = GaussianRasterizationSettings(
         image_height=height, image_width=width, tanfovx=width / (2 * fx), tanfovy=height / (2 * fy), bg=bg,
         scale_modifier=scale_modifier, viewmatrix=view, projmatrix=projection, sh_degree=sh_degree, campos=center,
-        **options)
+        camera_model=camera_model, distortion=tuple(distortion),
+        principal_point=None if camera_model == "pinhole" else (rows[0][2], rows[1][2]), **options)
+    resolve_lens(settings)
+    return settings
 
 
 def clip_matrix(K: torch.Tensor, width: int, height: int) -> torch.Tensor:

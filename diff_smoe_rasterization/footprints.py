@@ -17,7 +17,14 @@ from .arguments import as_rendering, op_arguments, op_options, tensor_checks
 from .autograd import INPUTS, OPTIONS, once_differentiable, refuse_transforms
 from .core import _core
 from .learned_gate import gate_of
-from .settings import BLEND_MODES, FEATURE_OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
+from .settings import (
+    BLEND_MODES,
+    FEATURE_OUTPUTS,
+    GaussianRasterizationSettings,
+    Rendering,
+    resolve_blend,
+    resolve_lens,
+)
 
 _OPS = torch.ops.diff_smoe_rasterization
 GATE_NUMBERS = 8
@@ -55,7 +62,7 @@ class Footprints(NamedTuple):
 
     @property
     def depths(self) -> torch.Tensor:
-        """[N] distances from the camera along its axis, the view z. They order the footprints."""
+        """[N] view z, or what `CAMERA_MODELS` has as the depth. They order the footprints."""
         return self.gates[:, 7]
 
     def rows(self, index: torch.Tensor) -> Footprints:
@@ -65,6 +72,21 @@ class Footprints(NamedTuple):
     def visible(self) -> Footprints:
         """Those of a radius above 0, in their order. The host waits for their number."""
         return self.rows(self.radii.nonzero().squeeze(1))
+
+    def around(self, width: int) -> Footprints:
+        """Those of an equirectangular image of this width, and the footprints that cross its seam on both sides of it.
+
+        The second copy of a footprint follows the others, moved by the width. Radii count 3 sigma: what lies beyond is
+        still cut. The host waits for the number of copies.
+        """
+        left = ((self.radii > 0) & (self.gates[:, 0] < self.radii)).nonzero().squeeze(1)
+        right = ((self.radii > 0) & (self.gates[:, 0] > width - 1 - self.radii)).nonzero().squeeze(1)
+        parts = [self]
+        for index, step in ((left, width), (right, -width)):
+            shift = self.gates.new_tensor([step, *[0] * (GATE_NUMBERS - 1)])
+            copies = self.rows(index)
+            parts.append(copies._replace(gates=copies.gates + shift))
+        return Footprints.joined(parts)
 
     @staticmethod
     def joined(parts: Sequence[Footprints]) -> Footprints:
@@ -97,6 +119,14 @@ def projection_arguments(settings: GaussianRasterizationSettings, means3D: torch
                          **tensors: Optional[torch.Tensor]) -> Tuple[List[Optional[torch.Tensor]], List[Any]]:
     """The tensors and the options of the op `project`, all but the last option. The arguments of the function."""
     return op_arguments("project_gaussians", settings, (), means3D, opacities, **tensors)
+
+
+def image_numbers(settings: GaussianRasterizationSettings) -> List[float]:
+    """What the ops on batches take of a view besides its tensors."""
+    model, lens = resolve_lens(settings)
+    most = _core.constants["most_lens_numbers"]
+    return [float(number) for number in (settings.image_width, settings.image_height, settings.tanfovx,
+                                         settings.tanfovy, model, len(lens))] + (lens + [0.0] * most)[:most]
 
 
 def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSettings,
@@ -147,7 +177,7 @@ def _spread(tensors: Sequence[torch.Tensor], present: Sequence[bool]) -> List[Op
 def _reach_moves(opacities: torch.Tensor, options: Dict[str, Any], gate: Optional[torch.Tensor]) -> torch.Tensor:
     """[N] bool: whether the squared reach is 2 log(opacity / least alpha) and the least alpha is constant.
 
-    Elsewhere the reach is constant. The rule is that of `squared_reach` and `AlphaCut` in include/dsmoe/gate.h.
+    Elsewhere the reach is constant. The rule is `squared_reach` and `AlphaCut` in include/dsmoe/gate.h.
     """
     positive, constants = opacities > 0, _core.constants
     if BLEND_MODES[options["blend_mode"]] in ("alpha", "smoe"):

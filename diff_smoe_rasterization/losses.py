@@ -18,7 +18,7 @@ def l1_ssim_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float 
     """(1 - lambda) mean |image - target| + lambda (1 - SSIM), the loss of 3D Gaussian Splatting.
 
     image: [..., H, W], float32 or float64. target: of the same shape and type, or uint8 (then 255 is 1); it gets no
-    gradient. SSIM is that of `fused_ssim`.
+    gradient. SSIM is as in `fused_ssim`.
     Raises ValueError or TypeError if shapes, types or devices do not fit.
     """
     check_tensors("l1_ssim_loss", image=image, target=target)
@@ -50,7 +50,7 @@ def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", tr
 
     img1, img2: [B, C, H, W] or [C, H, W]. padding: "same", windows reach into zeros outside the image; "valid", the
     mean leaves out the 5 pixels at each side whose windows do. train: whether a gradient may be asked for; only img1
-    gets one. The call is that of the package `fused_ssim`.
+    gets one. The call is as in the package `fused_ssim`.
     Raises ValueError or TypeError if arguments do not fit.
     """
     check_tensors("fused_ssim", img1=img1, img2=img2)

@@ -7,7 +7,7 @@ import torch
 
 from .arguments import as_rendering, op_arguments, tensor_checks, without_batch
 from .autograd import rasterize_op, refuse_transforms
-from .settings import GaussianRasterizationSettings, Rendering
+from .settings import GaussianRasterizationSettings, Rendering, resolve_lens
 from .splats import Splats
 
 
@@ -117,11 +117,13 @@ class GaussianRasterizer(torch.nn.Module):
 
     @torch.no_grad()
     def markVisible(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns which positions [N, 3] lie beyond the near plane, [N] bool."""
+        """Returns which positions [N, 3] have a depth above `near`, [N] bool."""
         required, _ = tensor_checks("markVisible", "positions", positions)
         viewmatrix = without_batch(required("viewmatrix", self.raster_settings.viewmatrix), 2)
         refuse_transforms("markVisible", (positions, viewmatrix))
-        return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near))
+        model, _ = resolve_lens(self.raster_settings)
+        return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near),
+                                                              model)
 
     def forward(self, means3D: torch.Tensor, means2D: _Absent, opacities: torch.Tensor, shs: _Absent = None,
                 colors_precomp: _Absent = None, scales: _Absent = None, rotations: _Absent = None,

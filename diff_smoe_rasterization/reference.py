@@ -12,6 +12,7 @@ What the paper leaves open is decided here:
   infinite, its opacity is above 1e20, its view depth is not beyond `near`, its projected covariance is not positive
   definite, its pixel position, conic or colour is not finite, or its footprint misses the image.
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
+- With a camera model other than "pinhole", a Gaussian beyond its lens's range is culled too: see `lens_points`.
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `tail_sum`.
@@ -26,6 +27,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, Optional, Sequence, Tuple
 
+import numpy as np
 import torch
 from torch.utils.checkpoint import checkpoint
 
@@ -81,7 +83,7 @@ class Splats(NamedTuple):
     """Projected Gaussians, one row each."""
 
     position: torch.Tensor  # [n, 2] px; the centre of pixel (0, 0) is at (0, 0)
-    depth: torch.Tensor  # [n] view z
+    depth: torch.Tensor  # [n] view z; the distance from the camera if the lens sees around
     covariance: torch.Tensor  # [n, 3] px^2: xx, xy, yy, low-pass included
     conic: torch.Tensor  # [n, 3] 1/px^2: the inverse of it
     opacity: torch.Tensor  # [n] compensated if antialiasing
@@ -253,9 +255,10 @@ def visible(gaussians, settings, mode):
     finite = finite.nonzero()[:, 0]
 
     splats = project(_rows(gaussians, finite), settings)
-    in_front = splats.depth > _float32(settings.near)
-    if settings.prefiltered and not in_front.all():
-        index = finite[~in_front][0].item()
+    in_front = splats.depth > _float32(settings.near)  # not so if it is NaN: beyond the lens's range
+    too_near = splats.depth <= _float32(settings.near)
+    if settings.prefiltered and too_near.any():
+        index = finite[too_near][0].item()
         raise ValueError(f"rasterize: prefiltered is set, but means3D[{index}] is not beyond the near plane")
     xx, xy, yy = splats.covariance.unbind(1)
     det = xx * yy - xy * xy
@@ -274,19 +277,11 @@ def visible(gaussians, settings, mode):
 
 def project(gaussians, settings):
     """Projects Gaussians to the image plane (Eq. 1, 2; EWA splatting as in 3DGS)."""
-    width, height = settings.image_width, settings.image_height
-    view, clip = _transform(gaussians.means3D, settings.viewmatrix), _transform(gaussians.means3D, settings.projmatrix)
-    ndc = clip[:, :2] / (clip[:, 3:] + W_EPSILON) + gaussians.means2D[:, :2]
-    size = ndc.new_tensor([width, height])
-    position = ((ndc + 1) * size - 1) / 2
-
-    x, y, z = view[:, :3].unbind(1)
-    limit_x, limit_y = FRUSTUM_MARGIN * settings.tanfovx, FRUSTUM_MARGIN * settings.tanfovy
-    slope_x, slope_y = (x / z).clamp(-limit_x, limit_x), (y / z).clamp(-limit_y, limit_y)
-    focal_x, focal_y = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack([torch.stack([focal_x / z, zero, -focal_x * slope_x / z], 1),
-                            torch.stack([zero, focal_y / z, -focal_y * slope_y / z], 1)], 1)
+    view = _transform(gaussians.means3D, settings.viewmatrix)[:, :3]
+    position, depth, jacobian = (pinhole_points if settings.camera_model == "pinhole" else lens_points)(
+        gaussians.means3D, view, settings)
+    position = position + gaussians.means2D[:, :2] * position.new_tensor(
+        [settings.image_width / 2, settings.image_height / 2])
     to_image = jacobian @ settings.viewmatrix[:3, :3].T
     raw = to_image @ covariance3D(gaussians, settings.scale_modifier) @ to_image.transpose(1, 2)
     raw_xx, xy, raw_yy = raw[:, 0, 0], raw[:, 0, 1], raw[:, 1, 1]
@@ -295,8 +290,154 @@ def project(gaussians, settings):
     opacity = gaussians.opacities
     if settings.antialiasing:
         opacity = opacity * ((raw_xx * raw_yy - xy * xy) / det).clamp(min=COMPENSATION_MIN).sqrt()
-    return Splats(position, z, torch.stack([xx, xy, yy], 1), torch.stack([yy, -xy, xx], 1) / det[:, None], opacity,
+    return Splats(position, depth, torch.stack([xx, xy, yy], 1), torch.stack([yy, -xy, xx], 1) / det[:, None], opacity,
                   color(gaussians, settings))
+
+
+def pinhole_points(points, view, settings):
+    """Returns positions in pixels [n, 2], depths [n] and Jacobians [n, 2, 3] by view coordinates.
+
+    points, view: [n, 3] world and view space.
+    """
+    width, height = settings.image_width, settings.image_height
+    clip = _transform(points, settings.projmatrix)
+    ndc = clip[:, :2] / (clip[:, 3:] + W_EPSILON)
+    x, y, z = view.unbind(1)
+    limit_x, limit_y = FRUSTUM_MARGIN * settings.tanfovx, FRUSTUM_MARGIN * settings.tanfovy
+    slope_x, slope_y = (x / z).clamp(-limit_x, limit_x), (y / z).clamp(-limit_y, limit_y)
+    focal_x, focal_y = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([torch.stack([focal_x / z, zero, -focal_x * slope_x / z], 1),
+                            torch.stack([zero, focal_y / z, -focal_y * slope_y / z], 1)], 1)
+    return ((ndc + 1) * ndc.new_tensor([width, height]) - 1) / 2, z, jacobian
+
+
+def lens_points(points, view, settings):
+    """The same of a lens. The Jacobian is torch's own derivative. A depth is NaN beyond the lens's range."""
+    del points
+    model, numbers = settings.camera_model, [float(number) for number in settings.distortion]
+    size = settings.image_width, settings.image_height
+    focal, principal, on_image = _image(view, settings)
+    keeps_graph = torch.is_grad_enabled()
+    with torch.enable_grad():
+        view = view if view.requires_grad else view.detach().requires_grad_()
+        plane, seen = on_plane(view, model, numbers)
+        position = on_image(plane)
+        if model == "opencv":  # the Jacobian is taken at most FRUSTUM_MARGIN times the image's slopes off axis
+            limits = focal.new_tensor(slope_limits(numbers, focal.tolist(), principal.tolist(), size))
+            slopes = plane.clamp(-limits, limits)
+            by_slope = [torch.autograd.grad(row.sum(), slopes, create_graph=True)[0]
+                        for row in on_image(slopes).unbind(1)]
+            z = view[:, 2:]
+            jacobian = torch.stack([torch.cat([row / z, -(row * slopes).sum(1, keepdim=True) / z], 1)
+                                    for row in by_slope], 1)
+        else:
+            jacobian = torch.stack([torch.autograd.grad(row.sum(), view, create_graph=True)[0]
+                                    for row in position.unbind(1)], 1)
+        depth = _depths(view, model).masked_fill(~seen, math.nan)
+    return (position, depth, jacobian) if keeps_graph else (position.detach(), depth.detach(), jacobian.detach())
+
+
+def positions_and_depths(view, settings):
+    """Returns both of a lens, [n, 2] and [n], without asking what the lens sees. view: [n, 3]."""
+    model, numbers = settings.camera_model, [float(number) for number in settings.distortion]
+    return _image(view, settings)[2](on_plane(view, model, numbers)[0]), _depths(view, model)
+
+
+def _image(view, settings):
+    """Returns focal lengths and principal point [2], and the function from a lens's plane to pixels."""
+    width, height = settings.image_width, settings.image_height
+    focal = view.new_tensor([width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)])
+    principal = settings.principal_point or (width / 2, height / 2)
+    if settings.camera_model == "equirectangular":
+        focal, principal = view.new_tensor([width / (2 * math.pi), height / math.pi]), (width / 2, height / 2)
+    principal = view.new_tensor(principal)
+    numbers = [float(number) for number in settings.distortion]
+    return focal, principal, lambda plane: focal * distorted(plane, settings.camera_model, numbers) + principal - 0.5
+
+
+def _depths(view, model):
+    return view.norm(dim=1) if model in SEES_AROUND else view[:, 2]
+
+
+SEES_AROUND = ("fisheye", "thin_prism_fisheye", "equirectangular")  # their depth is the distance
+FISHEYE_END = 0.97 * math.pi  # the angle to the axis where every fisheye ends
+POLE = 1e-3  # equirectangular: how near the axis of the poles, as a part of the distance, nothing is seen
+MOST_SLOPE = 1e3  # "opencv" ends there at the latest
+
+
+def on_plane(view, model, numbers):
+    """Returns points on the plane that a lens distorts [n, 2], and which of them the lens sees [n]."""
+    x, y, z = view.unbind(1)
+    if model == "orthographic":
+        return view[:, :2], torch.ones_like(z, dtype=torch.bool)
+    if model == "opencv":
+        plane = view[:, :2] / z[:, None]
+        return plane, plane.norm(dim=1) < distortion_end(model, numbers, MOST_SLOPE)
+    if model == "equirectangular":
+        horizontal = torch.hypot(x, z)
+        return (torch.stack([torch.atan2(x, z), torch.atan2(y, horizontal)], 1),
+                horizontal > POLE * view.norm(dim=1))
+    squared = x * x + y * y
+    near_axis = (squared < 1e-6 * z * z) & (z > 0)  # there theta / rho is a series, of which three terms are all
+    rho = torch.where(near_axis, torch.ones_like(squared), squared).sqrt()
+    e = torch.where(near_axis, squared / (z * z), torch.zeros_like(z))
+    ratio = torch.where(near_axis, (1 - e / 3 + e * e / 5) / torch.where(near_axis, z, torch.ones_like(z)),
+                        torch.atan2(rho, z) / rho)
+    plane = view[:, :2] * ratio[:, None]
+    return plane, plane.norm(dim=1) < distortion_end(model, numbers, FISHEYE_END)
+
+
+def _terms(model, numbers):
+    """Returns polynomials in r^2, constants first, that scale the radius (over, under), then p1, p2 and s1 to s4."""
+    k = list(numbers) + [0.0] * 12
+    if model == "opencv":
+        return [1.0, k[0], k[1], k[4]], [1.0, k[5], k[6], k[7]], k[2:4], k[8:12]
+    if model == "thin_prism_fisheye":
+        return [1.0, k[0], k[1], k[4], k[5]], [1.0], k[2:4], [k[6], 0.0, k[7], 0.0]
+    return [1.0, *k[:4]], [1.0], [0.0, 0.0], [0.0] * 4
+
+
+def distorted(plane, model, numbers):
+    """Returns the distorted points of a plane [n, 2], as OpenCV and COLMAP define them."""
+    over, under, (p1, p2), (s1, s2, s3, s4) = _terms(model, numbers)
+    u, v = plane.unbind(1)
+    squared = u * u + v * v
+    radial = (sum(c * squared**i for i, c in enumerate(over)) / sum(c * squared**i for i, c in enumerate(under)))
+    return torch.stack([
+        u * radial + 2 * p1 * u * v + p2 * (squared + 2 * u * u) + s1 * squared + s2 * squared**2,
+        v * radial + 2 * p2 * u * v + p1 * (squared + 2 * v * v) + s3 * squared + s4 * squared**2], 1)
+
+
+def distortion_end(model, numbers, end):
+    """Returns the least radius at which the distorted radius r R(r^2), or its denominator, stops rising; at most end.
+
+    Only the radial part counts: the roots of the numerator of its derivative, a polynomial in r^2.
+    """
+    over, under = (np.polynomial.Polynomial(terms) for terms in _terms(model, numbers)[:2])
+    q = np.polynomial.Polynomial([0.0, 1.0])
+    stops = [over * under + 2 * q * (over.deriv() * under - over * under.deriv()), under]
+    roots = [root.real for each in stops for root in each.trim().roots() if abs(root.imag) < 1e-9 and root.real > 0]
+    return min([end, *np.sqrt(roots)])
+
+
+def slope_limits(numbers, focal, principal, size):
+    """Returns FRUSTUM_MARGIN times the largest |x/z| and |y/z| of the image's edges and corners, by the radial part."""
+    over, under, *_ = _terms("opencv", numbers)
+    end = distortion_end("opencv", numbers, MOST_SLOPE)
+    edge = [max(centre, side - centre) / scale for centre, side, scale in zip(principal, size, focal)]
+
+    def stretch(radius):
+        low, high = 0.0, end
+        while True:
+            middle = 0.5 * (low + high)
+            if middle in (low, high):
+                return low / radius
+            q = middle * middle
+            value = middle * np.polyval(over[::-1], q) / np.polyval(under[::-1], q)
+            low, high = (middle, high) if value < radius else (low, middle)
+
+    return [FRUSTUM_MARGIN * side * max(stretch(side), stretch(math.hypot(*edge))) for side in edge]
 
 
 def _transform(points, matrix):

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Any, NamedTuple, Optional, Tuple, Union, cast
+from typing import TYPE_CHECKING, Any, List, NamedTuple, Optional, Sequence, Tuple, Union, cast
 
 if TYPE_CHECKING:
     import torch  # which takes seconds to load: the command line reads this file for its names
@@ -35,6 +35,25 @@ With a `background_gate` lambda > 0 the background is one more expert of both, b
 
 At lambda 0, the default, the background is seen in `smoe` where Gaussians end, and in `smoe_eq7` where no gate is open.
 At lambda 1 `smoe_eq7` is alpha blending.
+"""
+
+CAMERA_MODELS = ("pinhole", "orthographic", "opencv", "fisheye", "thin_prism_fisheye", "equirectangular")
+"""The camera models, by number in the C++ core.
+
+================== =============================================== ================================== ========
+name               distortion                                      what it sees                       depth
+================== =============================================== ================================== ========
+pinhole            none; its projection is `projmatrix`            depths above `near`                view z
+orthographic       none; focal lengths in pixels by unit of length depths above `near`                view z
+opencv             k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4             until the distorted radius stops   view z
+fisheye            k1 k2 k3 k4 (Kannala-Brandt)                    until it stops; 174.6 degrees      distance
+thin_prism_fisheye k1 k2 p1 p2 k3 k4 sx1 sy1                       until it stops; 174.6 degrees      distance
+equirectangular    none                                            all but 0.06 degrees at the poles  distance
+================== =============================================== ================================== ========
+
+`near`, the order of the Gaussians and the depth images take the depth so. `opencv` has the first 0, 1, 2, 4, 5, 8 or 12
+of its numbers, `fisheye` 0, 1, 2 or 4. COLMAP's OPENCV and FULL_OPENCV are `opencv`, and its OPENCV_FISHEYE is
+`fisheye`, with their numbers in the same order.
 """
 
 _FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_eq7": None, "smoe_tn": 0.0, "smoe_std": 0.0}
@@ -101,6 +120,12 @@ class GaussianRasterizationSettings(NamedTuple):
     # all, as in the authors' program and in the text; slower. 0: in none. None: $DSMOE_FAINT_BELOW, else 0.25 in
     # `smoe`, 2 in `smoe_eq7`. The other modes ignore it
     faint_below: Optional[float] = None
+    # One of CAMERA_MODELS. But for "pinhole", `viewmatrix` has all of the pose, `projmatrix` is not read and gets no
+    # gradient, and the focal lengths are image_width / (2 tanfovx) and image_height / (2 tanfovy)
+    camera_model: str = "pinhole"
+    distortion: Sequence[float] = ()  # as CAMERA_MODELS has them
+    # pixels; the centre of the first pixel is (0.5, 0.5). None: of the image. A pinhole's is in `projmatrix`
+    principal_point: Optional[Tuple[float, float]] = None
 
 
 class Rendering(NamedTuple):
@@ -221,6 +246,36 @@ def usual_faint_below(blend_mode: str) -> float:
 def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:
     """Returns whether a rendering in this blend mode has pixels in which faint pairs do not count."""
     return blend_mode in GATED_MODES and resolve_faint_below(blend_mode, faint_below) <= 1
+
+
+def resolve_lens(settings: GaussianRasterizationSettings) -> Tuple[int, List[float]]:
+    """Returns the number of the camera model, and the principal point and distortion that the ops take.
+
+    Raises ValueError for a name that is not in CAMERA_MODELS, for what are no numbers, and for a pinhole with either.
+    The core refuses wrong counts and values.
+    """
+    model, distortion, principal_point = settings.camera_model, settings.distortion, settings.principal_point
+    if model == "pinhole":
+        for name, value in (("distortion", None if len(distortion) == 0 else distortion),
+                            ("principal_point", principal_point)):
+            if value is not None:
+                other = "its principal point is in projmatrix" if name == "principal_point" else \
+                    f"name the lens that has it: {', '.join(CAMERA_MODELS[2:5])}"
+                raise ValueError(f"{name} is {value!r}, but camera_model is 'pinhole'; {other}")
+        return 0, []
+    if model not in CAMERA_MODELS:
+        raise ValueError(f"camera_model is {model!r}; it must be one of {', '.join(CAMERA_MODELS)}")
+    if principal_point is None:
+        principal_point = (settings.image_width / 2, settings.image_height / 2)
+    numbers = []
+    for name, values in (("principal_point", principal_point), ("distortion", distortion)):
+        try:
+            numbers.append([float(value) for value in values])
+        except (TypeError, ValueError, RuntimeError):
+            raise ValueError(f"{name} is {values!r}; it must be a sequence of numbers") from None
+    if len(numbers[0]) != 2:
+        raise ValueError(f"principal_point is {principal_point!r}; it must be two numbers")
+    return CAMERA_MODELS.index(model), [*numbers[0], *numbers[1]]
 
 
 def _gated_names() -> str:

@@ -25,9 +25,9 @@ TRAIN_EXAMPLES = """examples:
 
 
 # Options of a training that `dsmoe simplify` offers as they are.
-SIMPLIFY_OPTIONS = ("images", "strict", "resolution", "test_every", "principal_point", "white_background", "blend_mode",
-                    "background_gate", "faint_below", "strategy_options", "device", "seed", "deterministic",
-                    "eval_every", "checkpoint_every")
+SIMPLIFY_OPTIONS = ("images", "strict", "resolution", "test_every", "principal_point", "lenses", "white_background",
+                    "blend_mode", "background_gate", "faint_below", "strategy_options", "device", "seed",
+                    "deterministic", "eval_every", "checkpoint_every")
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -93,6 +93,9 @@ class TrainConfig:
     principal_point: str = _option(
         "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
         choices=PRINCIPAL_POINTS)
+    lenses: str = _option(
+        "undistort", "undistort: images of distorted lenses and fisheyes become those of a pinhole, by OpenCV; native: "
+                     "they stay, and Gaussians are projected through the lens", choices=("undistort", "native"))
     test_every: int = _option(
         8, "every so many images, sorted by name, one is kept for testing, the first among them; 0: none. A scene that "
            "lists its test images itself keeps those")
@@ -147,7 +150,6 @@ class TrainConfig:
         15_000, "densification stops before this step; all milestones of importance are parts of it")
     densification_interval: int = _option(100, "steps between two densifications")
     opacity_reset_interval: int = _option(3000, "steps between two opacity resets")
-    half_until_iter: int = _option(0, "train on images of half the width and height until this step; 0: never")
 
     eval_every: int = _option(0, "evaluate the test views every so many steps; 0: only at the end")
     checkpoint_every: int = _option(1000, "write a checkpoint every so many steps; 0: only at the end")
@@ -211,7 +213,7 @@ class TrainConfig:
         for name in ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr",
                      "densify_grad_threshold", "percent_dense", "background_gate_lr"):
             self._require(name, 0.0 < getattr(self, name) < float("inf"), "a positive number")
-        for name in ("densify_from_iter", "densify_until_iter", "half_until_iter", "eval_every", "checkpoint_every"):
+        for name in ("densify_from_iter", "densify_until_iter", "eval_every", "checkpoint_every"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         return self
 

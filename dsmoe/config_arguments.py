@@ -13,8 +13,8 @@ from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, with_preset
 
 # How `--help` groups the options; those that no group names are of the last one.
 GROUPS = {
-    "scene": ("images", "strict", "resolution", "test_every", "principal_point", "init_points", "white_background",
-              "random_background"),
+    "scene": ("images", "strict", "resolution", "test_every", "principal_point", "lenses", "init_points",
+              "white_background", "random_background"),
     "blending": ("blend_mode", "background_gate", "background_gate_bound", "faint_below", "antialiasing"),
     "length, and number of Gaussians": ("iterations", "batch", "init", "budget", "strategy", "strategy_options"),
     "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),

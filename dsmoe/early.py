@@ -22,8 +22,6 @@ def check_early(arguments: argparse.Namespace) -> None:
         check_photos(arguments.photos)
     elif command == "train" and not arguments.resume and scene and getattr(arguments, "output", ""):
         check_scene(scene)
-        if getattr(arguments, "init", ""):
-            check_model(arguments.init)
         _check_options(arguments)
     elif command == "simplify":
         check_model(arguments.model)
@@ -40,14 +38,15 @@ def check_early(arguments: argparse.Namespace) -> None:
             check_orbit(arguments.frames, arguments.fps)
         if command == "export" and arguments.output:
             check_output(arguments.output, arguments.overwrite)
-    if command in ("eval", "render", "export", "view", "simplify") and scene:
+    if command in ("simplify", "eval", "render", "export", "view") and scene:
         check_scene(scene)
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
     """Raises ConfigError for a number that no strategy and no preset takes."""
-    if getattr(arguments, "init", ""):  # that model says how it is blended
-        return
+    if getattr(arguments, "init", ""):
+        check_model(arguments.init)
+        return  # that model says how it is blended
     arguments = copy.copy(arguments)
     take_paper(arguments)
     given = {**given_options(arguments), "device": "cpu", "strategy": "steady", "strategy_options": ""}
@@ -64,7 +63,7 @@ def check_source(source: str, besides: str = "") -> None:
 
 
 def check_model(source: str) -> None:
-    """Raises TrainerError if there is no such file or folder."""
+    """Raises TrainerError if there is no such file or folder of a model to start from."""
     if not is_file(source) and not is_folder(source):
         raise TrainerError(f"{source}: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of "
                            "`dsmoe train` or a model folder of 3DGS")

@@ -26,8 +26,6 @@ class ImportanceOptions:
     views: int = _setting(80, lambda x: x >= 1, "at least 1")
     # The most Gaussians that move at a time, as a part of all; 0: none.
     moves: float = _setting(0.1, lambda x: 0 <= x <= 1, "between 0 and 1")
-    # Training views that a move looks at; 0: as many as a removal.
-    move_views: int = _setting(0, lambda x: x >= 0, "at least 0")
     # Moves are this part of densify_until_iter apart: one over the number.
     pace: int = _setting(30, lambda x: 1 <= x <= 1000, "at least 1 and at most 1000")
     # A Gaussian moves if its cost is below this part of the error at its new place.

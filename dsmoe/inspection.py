@@ -182,7 +182,7 @@ def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, sub
     make_folder(folder)
     with only_one(folder), torch.no_grad():
         earlier = own_record(folder, RENDER, overwrite)
-        kept = earlier.files if subject == earlier.subject else []  # those of another split
+        kept = earlier.files if subject == earlier.subject else []  # of another split
         write_record(folder, RENDER, Record(subject, sorted({*kept, *written})), earlier.files, overwrite)
         remove_files(folder, written)
         paths = [os.path.join(folder, stem) for stem in stems]
@@ -201,7 +201,7 @@ def said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
     model = os.stat(ply)
     return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on "
             f"{os.path.abspath(config.scene)}: {renderer.blend_mode} {renderer.background_gate}, resolution "
-            f"{config.resolution}, principal point {config.principal_point}, "
+            f"{config.resolution}, principal point {config.principal_point}, lenses {config.lenses}, "
             f"{'white' if config.white_background else 'black'} background")
 
 

@@ -212,7 +212,7 @@ class GaussianOptimizer:
         return lazy
 
     def start_higher_bands(self) -> None:
-        """Gives `shs` its Adam state if it has none yet, as old as that of `dc`.
+        """Gives `shs` its Adam state if it has none yet, with the step count of `dc`.
 
         While degree 0 is active its gradient would be zero: Adam would leave it where it is and only count the
         step. Skipping that, and taking over the count, gives the same numbers and saves most of the step's time.

@@ -19,7 +19,7 @@ from .system.device import check_device
 from .system.files import is_folder
 from .train import earlier_files, train
 
-UNTIL = 0.5  # removals end at 0.95 of this part of the iterations, moves at 1.33 of it
+UNTIL = 0.35  # as with --fast: removals end at 0.95 of this part of the iterations, moves at 1.33 of it
 FIRST_POSITION_RATE = 0.000064  # times the scene extent: trained positions move little
 CHECKPOINT_EVERY = {"cpu": 1000, "cuda": 0}  # on a GPU a checkpoint takes longer than the steps that it would save
 # --loses tries these parts of the model, one after the other.

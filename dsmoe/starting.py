@@ -123,9 +123,9 @@ def read_start(path: str) -> Start:
 
 def find_model(source: str) -> Found:
     """The model in a file, an output folder of `dsmoe train` or a model folder of 3DGS. Raises TrainerError."""
+    check_model(source)
     if is_file(source):
         return Found(source)
-    check_model(source)
     if holds_run(source):
         return _found_run(source)
     path = latest_model(source)
@@ -150,7 +150,7 @@ def _found_run(folder: str) -> Found:
         names += ["blend_mode", "background_gate"]
     photographs = is_folder(config.scene)
     if photographs:
-        names += ["scene", "images", "strict", "resolution", "principal_point"]
+        names += ["scene", "images", "strict", "resolution", "principal_point", "lenses"]
     options = {name: getattr(config, name) for name in names}
     if not photographs and is_file(os.path.join(folder, CAMERAS)):
         options.update(scene=folder, resolution=1)  # the cameras are those of the resized images

@@ -21,6 +21,7 @@ __all__ = ["compute_relocation", "quat_scale_to_covar_preci", "rasterization"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 EVERYTHING_NEARER = 1e10  # the far_plane that leaves nothing out
+CAMERA_MODELS = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
 GLOBAL_SHUTTER = "GLOBAL"  # the name of the other value of rolling_shutter that switches it off
 
 
@@ -34,8 +35,10 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
                   channel_chunk: int = 32, distributed: bool = False, camera_model: str = "pinhole",
                   segmented: bool = False, covars: Optional[torch.Tensor] = None, blend_mode: Optional[str] = None,
                   background_gate: Optional[BackgroundGate] = None, faint_below: Optional[float] = None,
+                  radial_coeffs: Optional[torch.Tensor] = None, tangential_coeffs: Optional[torch.Tensor] = None,
+                  thin_prism_coeffs: Optional[torch.Tensor] = None,
                   **others: Any) -> Tuple[torch.Tensor, torch.Tensor, Dict[str, Any]]:
-    """Renders N Gaussians with C pinhole cameras.
+    """Renders N Gaussians with C cameras.
 
     Args:
         means: [N, 3] centres, world.
@@ -56,6 +59,11 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
             channel.
         rasterize_mode: "classic" or "antialiased".
         covars: [N, 3, 3] in place of quats and scales, which are then ignored.
+        camera_model: "pinhole", "ortho" (Ks has pixels by unit of length) or "fisheye". Of a fisheye depths are
+            distances, for near_plane and far_plane too.
+        radial_coeffs: [C, 6] k1 to k6 of a pinhole, or [C, 4] k1 to k4 of a fisheye. tangential_coeffs: [C, 2] p1, p2,
+            and thin_prism_coeffs: [C, 4] s1 to s4, of a pinhole. The host reads all. The footprint is that of the
+            affine approximation, not gsplat's unscented transform.
         blend_mode: one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha".
         background_gate: `smoe` and `smoe_eq7`: how much the background weighs, a number or a tensor of one element,
             which gets a gradient; None: $DSMOE_BACKGROUND_GATE, else 0.
@@ -74,13 +82,15 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
             ids [M] say which.
 
     Raises:
-        NotImplementedError: what is asked for is not offered: sparse_grad, distributed, other cameras, arguments of
-            later versions of gsplat but with the values that switch them off.
+        NotImplementedError: what is asked for is not offered: sparse_grad, distributed, other cameras, tangential and
+            prism coefficients of a fisheye, other arguments of later versions of gsplat but with the values that
+            switch them off.
         ValueError, TypeError: arguments do not fit.
     """
-    _refuse_what_is_not_offered(
-        others, sparse_grad=(sparse_grad, False), distributed=(distributed, False),
-        camera_model=(camera_model, "pinhole"))
+    _refuse_what_is_not_offered(others, sparse_grad=(sparse_grad, False), distributed=(distributed, False))
+    if camera_model not in CAMERA_MODELS:
+        raise NotImplementedError(f"rasterization: camera_model is {camera_model!r}; this module offers "
+                                  f"{', '.join(CAMERA_MODELS)}")
     for name, size in (("width", width), ("height", height)):
         if not isinstance(size, (int, np.integer)) or size < 1:
             raise ValueError(f"rasterization: {name} is {size!r}; it must be a whole number of pixels, 1 or more")
@@ -109,19 +119,21 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
     _check_shape("backgrounds", backgrounds, (num_cameras, channels))
     shape = _shape(quats, scales, covars, count)
 
-    means2d, depths = _image_points(means, viewmats, Ks)
+    model, distortions = _distortions(camera_model, num_cameras, radial_coeffs, tangential_coeffs, thin_prism_coeffs)
     differentiable = [means, opacities, colors, viewmats, backgrounds, *shape.values()]
     with_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in differentiable)
     projections = viewmats.transpose(1, 2) @ clip_matrix(Ks.detach(), width, height).transpose(1, 2).contiguous()
     centres = torch.inverse(viewmats)[:, :3, 3]
-    focal_lengths = Ks[:, (0, 1), (0, 1)].tolist()
+    intrinsics = Ks[:, :2].tolist()
     all_settings = [GaussianRasterizationSettings(
         image_height=height, image_width=width, tanfovx=width / (2 * focal_x), tanfovy=height / (2 * focal_y),
         bg=backgrounds[camera], scale_modifier=1.0, viewmatrix=viewmats[camera].T, projmatrix=projections[camera],
         sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
         near=near_plane, blend_mode=blend_mode, background_gate=background_gate, low_pass=eps2d,
-        faint_below=faint_below)
-        for camera, (focal_x, focal_y) in enumerate(focal_lengths)]
+        faint_below=faint_below, camera_model=model, distortion=distortions[camera],
+        principal_point=None if model == "pinhole" else (center_x, center_y))
+        for camera, ((focal_x, _, center_x), (_, focal_y, center_y)) in enumerate(intrinsics)]
+    means2d, depths = _image_points(means, viewmats, Ks, all_settings)
     clips = far_plane < EVERYTHING_NEARER or radius_clip > 0
     if packed or clips:  # else the radii come with the images
         seen = torch.stack([visible_radii(means, settings, **shape) for settings in all_settings])
@@ -161,13 +173,35 @@ def _shape(quats, scales, covars, count):
     return {"scales": scales, "rotations": functional.normalize(quats, dim=1)}
 
 
+def _distortions(camera_model, num_cameras, radial, tangential, thin_prism):
+    """Returns the camera model of the settings and the distortion of each camera."""
+    given = {"radial_coeffs": radial, "tangential_coeffs": tangential, "thin_prism_coeffs": thin_prism}
+    counts = {"pinhole": (6, 2, 4), "fisheye": (4, 0, 0), "ortho": (0, 0, 0)}[camera_model]
+    columns = []
+    for (name, value), count in zip(given.items(), counts):
+        if value is not None and count == 0:
+            raise NotImplementedError(f"rasterization: {name} is given; camera_model {camera_model!r} has none here")
+        if value is not None:
+            _check_shape(name, value, (num_cameras, count))
+        columns.append([[0.0] * count] * num_cameras if value is None else value.tolist())
+    if all(value is None for value in given.values()):
+        return CAMERA_MODELS[camera_model], [()] * num_cameras
+    if camera_model == "fisheye":
+        return "fisheye", [tuple(k) for k in columns[0]]
+    return "opencv", [(*k[:2], *p, *k[2:], *s) for k, p, s in zip(*columns)]
+
+
 @torch.no_grad()
-def _image_points(means, viewmats, Ks):
+def _image_points(means, viewmats, Ks, all_settings):
     """Returns the centres on the images [C, N, 2] in pixels, detached, and their depths [C, N].
 
     The centre of the first pixel is at (0.5, 0.5), as gsplat has it.
     """
     in_view = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
+    if all_settings[0].camera_model != "pinhole":
+        points, depths = zip(*(reference.positions_and_depths(view, settings)
+                               for view, settings in zip(in_view, all_settings)))
+        return torch.stack(points) + 0.5, torch.stack(depths)
     depths = in_view[..., 2]
     focal_lengths, principal_points = Ks[:, None, (0, 1), (0, 1)], Ks[:, None, :2, 2]
     return focal_lengths * in_view[..., :2] / depths[..., None] + principal_points, depths

@@ -131,6 +131,7 @@ View transforms_view(const Node& file, const Node& frame, ImageSize size) {
 /// An entry of cameras.json: position and rotation of the camera in the world.
 View inria_view(const Node& camera) {
   View view;
+  if (camera.has("camera_model")) camera.at("camera_model").fail("must be absent: only pinhole cameras can be rendered");
   view.name = camera.at("img_name").text();
   view.width = camera.at("width").side(), view.height = camera.at("height").side();
   view.fx = camera.at("fx").positive(), view.fy = camera.at("fy").positive();

@@ -213,7 +213,7 @@ def _method(method: Values, where: str, protocol: Values, folder: str) -> Values
     if "budget" in given:
         wanted = {COUNTED_BY[name]: str(given["budget"])}
         if name == "taming":
-            wanted["--mode"] = "final_count"  # else its number is a multiple of that of the first points
+            wanted["--mode"] = "final_count"  # else its number is a multiple of the first points'
         refuse(not wanted.items() <= dict(zip(arguments, arguments[1:])).items(),
                f"{where}.budget: is {given['budget']}; {name} is told so by its arguments, among which must be "
                f"{' '.join(itertools.chain(*wanted.items()))}")

@@ -45,7 +45,7 @@ CELL_NAME = "cell.json"  # in it: what is trained on what
 ROW_NAME = "row.json"  # in it too: what came out
 SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its cells, run or not
 
-# Options of the native trainer that a suite may set: those of the recipe. The others have a field of their own.
+# Options of the native trainer's schedule, which a suite may set. The others have a field of their own.
 RECIPE = (*TRAINER_RECIPE, "strategy_options")
 
 # LPIPS's weights, .npz: conv1.weight [outputs, inputs, h, w], conv1.bias, ..., lin0.weight, ..., lin4.weight.

@@ -38,7 +38,7 @@ RULES = {
 
 
 def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
-    """The cell as options of the native trainer, whose names are those of 3DGS. Raises ConfigError."""
+    """The cell as options of the native trainer, which have 3DGS's names. Raises ConfigError."""
     protocol, scene = cell["protocol"], cell["scene"]
     config = TrainConfig(
         scene=scene["path"] or "", output=output, blend_mode=cell["blend_mode"],

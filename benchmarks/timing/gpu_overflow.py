@@ -5,7 +5,7 @@
     python benchmarks/timing/gpu_overflow.py --train SCENE -o OUT --device cuda ...    # the words of `dsmoe train`
 
 The frame is one captured graph. Captured while no Gaussian is visible, it has room for 65,536 instances; all Gaussians
-come back before it is replayed. The count of a training is that of its renderings, evaluations included.
+come back before it is replayed. The count of a training includes its evaluations.
 """
 from __future__ import annotations
 

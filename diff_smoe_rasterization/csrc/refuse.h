@@ -1,8 +1,9 @@
-// What the passes of both backends refuse: comparisons on the host, a few a call. Messages have one form: "function:
+// What the functions of both backends refuse: comparisons on the host, a few a call. Messages have one form: "function:
 // name is this; it must be that". A pointer is only compared with null; an array without elements may be null.
 #pragma once
 
 #include <cstdint>
+#include <initializer_list>
 #include <limits>
 #include <sstream>
 #include <stdexcept>
@@ -24,6 +25,19 @@ template <class... Parts> [[noreturn]] void refuse(const char* function, const P
 // size: 0 if the array has no elements.
 inline void refuse_null(const char* function, const char* name, const void* array, const char* shape, int64_t size) {
   if (array == nullptr && size > 0) refuse(function, name, " is null; it must point to an array ", shape);
+}
+
+struct NamedArray {
+  const char* name;
+  const void* array;
+};
+
+// Arrays of tensors[i]. size: of each.
+inline void refuse_null_fields(const char* function, size_t i, int64_t size, std::initializer_list<NamedArray> fields) {
+  for (const NamedArray& field : fields) {
+    if (field.array != nullptr || size <= 0) continue;
+    refuse(function, "tensors[", i, "].", field.name, " is null; it must point to an array of ", size, " numbers");
+  }
 }
 
 template <class S> void refuse_negative(const char* function, const char* name, S value) {
@@ -139,9 +153,16 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
   refuse_negative(function, "near", camera.near);
   refuse_negative(function, "scale_modifier", frame.config.scale_modifier);
   refuse_negative(function, "low_pass", frame.config.low_pass);
+  const bool pinhole = camera.lens.model == LensModel::kPinhole;
+  if (!pinhole) {
+    refuse_unless_positive(function, "camera.lens.focal.x", camera.lens.focal.x);
+    refuse_unless_positive(function, "camera.lens.focal.y", camera.lens.focal.y);
+  }
   if constexpr (kOnHost<Frame>) {
     refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", camera.view);
-    refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
+    if (pinhole) {
+      refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
+    }
     const bool read = frame.inputs.dc != nullptr || frame.inputs.shs != nullptr;
     for (int i = 0; read && i < 3; ++i) refuse_unless_finite(function, "camera.position (campos)", camera.position, i);
   } else {
@@ -156,7 +177,7 @@ template <class Frame> void refuse_radii(const char* function, const Frame& fram
   refuse_null(function, "images.radii", frame.images.radii, "[N]", frame.inputs.num_gaussians);
 }
 
-// A batch of views that is not as its struct says. Frame: that of the backend. refuse_view(view): refuses what a stage
+// A batch of views that is not as its struct says. Frame: the backend's. refuse_view(view): refuses what a stage
 // cannot read or write of a view.
 template <class Frame, class Batch, class Refuse>
 void refuse_batch(const char* function, const Batch& batch, const Refuse& refuse_view) {

@@ -7,7 +7,7 @@ import torch
 
 from diff_smoe_rasterization.autograd import INPUTS
 from diff_smoe_rasterization.core import _core
-from diff_smoe_rasterization.footprints import GATE_NUMBERS, projection_arguments
+from diff_smoe_rasterization.footprints import GATE_NUMBERS, image_numbers, projection_arguments
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -26,8 +26,7 @@ class ViewRows:
             some = settings[begin:begin + most]
             inputs, options = projection_arguments(some[0], means3D, opacities, **tensors)
             cameras = [tensor for each in some for tensor in (each.viewmatrix, each.projmatrix, each.campos)]
-            images = [float(number) for each in some
-                      for number in (each.image_width, each.image_height, each.tanfovx, each.tanfovy)]
+            images = [number for each in some for number in image_numbers(each)]
             self._arguments.append((*inputs, *options, True, cameras, images))
         self._present = [tensor is not None for tensor in inputs]
         counted = [_OPS.count_rows(*arguments) for arguments in self._arguments]

@@ -47,7 +47,7 @@ def rotatable_rows(gaussians: Gaussians) -> List[np.ndarray]:
 
 
 def y_up(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians after half a turn about x: from COLMAP's axes (y down, z forward) to those of OpenGL."""
+    """The same Gaussians after half a turn about x: from COLMAP's axes (y down, z forward) to OpenGL's."""
     signs = np.concatenate([[1], TURNED_AXES]).astype(np.float32)  # of w, x, y, z: R becomes D R D, with D = its turn
     harmonics = TURNED_HARMONICS[:gaussians.shs.shape[1], None]
     return dataclasses.replace(gaussians, means3D=gaussians.means3D * TURNED_AXES,

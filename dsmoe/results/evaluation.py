@@ -52,7 +52,7 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
 def rows_of_views(render: Callable[[Sequence[View]], Dict[int, torch.Tensor]], batches: Sequence[Sequence[View]],
                   device: str, progress: bool = False, measure: Measure = image_metrics, passes: int = PASSES,
                   agreed: Callable[[float], float] = float) -> List[Dict[str, Any]]:
-    """What `summary` takes. `evaluate` says what is timed; a view's time is its part of that of its batch.
+    """What `summary` takes. `evaluate` says what is timed; a view's time is its share of its batch's.
 
     render: the images of a batch by their index in it, all or some. agreed: from the seconds that one process has
     rendered to those by which all decide on a further pass.

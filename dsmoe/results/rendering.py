@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Sequence, Tuple
 
 import torch
 
@@ -80,6 +80,22 @@ class Renderer:
             arguments.update(model.color_arguments())
         opacities, scales, rotations = model.activated()
         return function(model.raw["means3D"], opacities, settings, scales=scales, rotations=rotations, **arguments)
+
+    def prepare(self, cameras: Sequence[Camera]) -> None:
+        """Makes the settings of all cameras, whose matrices go to the device at once.
+
+        Else each rendering by a new camera would send its own, for which the host waits until the device is idle.
+        """
+        if not cameras:
+            return
+        made = [camera.settings(self.background.cpu(), 0, self.blend_mode, self.antialiasing) for camera in cameras]
+        rows = [torch.cat([one.viewmatrix.flatten(), one.projmatrix.flatten(), one.campos, one.campos.new_zeros(1)])
+                for one in made]  # with the last number each tensor begins at a multiple of 16 bytes
+        sent = torch.stack(rows).to(self.background.device)
+        for camera, one, row in zip(cameras, made, sent):
+            self._settings[id(camera)] = (camera, one._replace(
+                bg=self.background, viewmatrix=row[:16].view(4, 4), projmatrix=row[16:32].view(4, 4),
+                campos=row[32:35]))
 
     def settings_of(self, camera: Camera, background: Optional[torch.Tensor] = None,
                     background_gate: Optional[torch.Tensor] = None) -> GaussianRasterizationSettings:

@@ -53,14 +53,14 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
                        densify_until_iter=config.densify_until_iter)
     if config.unusual_recipe():
         unusual["recipe"] = config.unusual_recipe()
-    if config.half_until_iter:
-        unusual["half_until_iter"] = config.half_until_iter
     if config.random_background:
         unusual["random_background"] = True
     if scene.missing:
         unusual["images_left_out"] = scene.missing
     if scene.note:
         unusual["undistortion"] = "by OpenCV, bicubic; focal lengths, principal points and sizes stay"
+    if config.lenses == "native":
+        unusual["lenses"] = "native"
     if any(view.mask is not None for view in views):
         unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"
     return {

@@ -1,9 +1,9 @@
-"""Pinhole cameras and the matrices that a 3DGS rasterizer takes."""
+"""Cameras and the matrices that a 3DGS rasterizer takes."""
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Optional, Sequence
+from typing import Any, Dict, Optional, Sequence
 
 import numpy as np
 import torch
@@ -11,12 +11,14 @@ import torch
 from diff_smoe_rasterization.camera import settings_from_camera
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
+from .lens import Lens
+
 LARGEST = 1e9  # of all numbers of a camera, pixels or world units: with larger ones float32 overflows
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; view axes are x right, y down, z forward, in world units.
+    """A camera; view axes are x right, y down, z forward, in world units.
 
     Pixel coordinates are COLMAP's: the centre of the top left pixel is (0.5, 0.5).
     """
@@ -30,6 +32,7 @@ class Camera:
     cy: float
     width: int
     height: int
+    lens: Optional[Lens] = None  # None: a pinhole
 
     @property
     def center(self) -> np.ndarray:
@@ -42,11 +45,6 @@ class Camera:
         return dataclasses.replace(self, fx=self.fx * sx, cx=self.cx * sx, fy=self.fy * sy, cy=self.cy * sy,
                                    width=width, height=height)
 
-    def halved(self) -> Camera:
-        """The same pixels, two by two, without an odd last row or column."""
-        return dataclasses.replace(self, fx=self.fx / 2, cx=self.cx / 2, fy=self.fy / 2, cy=self.cy / 2,
-                                   width=self.width // 2, height=self.height // 2)
-
     def centred(self) -> Camera:
         """The same view with the principal point moved to the image centre."""
         return dataclasses.replace(self, cx=self.width / 2, cy=self.height / 2)
@@ -58,9 +56,13 @@ class Camera:
 
         background: [3]. dtype: of the matrices, by default the background's.
         """
-        K = [[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]]
+        K: Any = [[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]]
+        lens: Dict[str, Any] = {}
+        if self.lens:
+            lens = {"camera_model": self.lens.camera_model, "distortion": self.lens.coefficients}
+            K = None if lens["camera_model"] == "equirectangular" else K
         return settings_from_camera(K, self.rotation, self.translation, self.width, self.height, background, sh_degree,
-                                    scale_modifier, dtype, antialiasing=antialiasing, blend_mode=blend_mode)
+                                    scale_modifier, dtype, antialiasing=antialiasing, blend_mode=blend_mode, **lens)
 
 
 def quaternion_to_rotation(quaternion: Sequence[float]) -> np.ndarray:

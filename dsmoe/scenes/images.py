@@ -7,11 +7,10 @@ import io
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import BinaryIO, Dict, List, Optional, Sequence, Tuple, Union
+from typing import BinaryIO, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from PIL import Image, UnidentifiedImageError
 
 from diff_smoe_rasterization.images import as_float
@@ -56,22 +55,11 @@ class View:
         """[1, H, W] in [0, 1]; None if every pixel counts."""
         return None if self.mask is None else as_float(self.mask)
 
-    def halved(self) -> View:
-        """At half the width and height, by means of four pixels; the last ones are left out if they are odd."""
-        if min(self.camera.width, self.camera.height) < 2:
-            return self
-        planes = {name: F.avg_pool2d(plane.float(), 2).round().to(plane.dtype)
-                  for name, plane in self._planes().items()}
-        return dataclasses.replace(self, camera=self.camera.halved(), **planes)
-
-    def _planes(self) -> Dict[str, torch.Tensor]:
-        """All that are there."""
-        planes = {name: getattr(self, name) for name in ("image", "opacity", "mask")}
-        return {name: plane for name, plane in planes.items() if plane is not None}
-
     def to(self, device: str) -> View:
         """The same view with its images on `device`."""
-        return dataclasses.replace(self, **{name: plane.to(device) for name, plane in self._planes().items()})
+        planes = {name: getattr(self, name) for name in ("image", "opacity", "mask")}
+        return dataclasses.replace(self, **{name: plane.to(device) for name, plane in planes.items()
+                                            if plane is not None})
 
 
 def open_image(file: Union[str, BinaryIO]) -> Image.Image:

@@ -77,6 +77,15 @@ def without_missing(folder: str, layout: Layout, strict: bool) -> Layout:
     return dataclasses.replace(layout, train=train, test=test, missing=[image.camera.name for image in missing])
 
 
+def with_lenses(layout: Layout) -> Layout:
+    """The layout with each image's lens in its camera, so that nothing is to be undistorted."""
+    def native(image: PosedImage) -> PosedImage:
+        return dataclasses.replace(image, camera=dataclasses.replace(image.camera, lens=image.lens), lens=None)
+
+    return dataclasses.replace(layout, train=[native(image) if image.lens else image for image in layout.train],
+                               test=[native(image) if image.lens else image for image in layout.test])
+
+
 def with_masks(folder: str, layout: Layout) -> Layout:
     """The layout with each image's mask, if the scene has a folder of masks.
 

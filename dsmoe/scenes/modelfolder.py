@@ -1,6 +1,8 @@
 """The folder of a trained 3DGS model as a scene: the cameras of cameras.json, and what the model shows there."""
 from __future__ import annotations
 
+import collections
+import dataclasses
 import glob
 import hashlib
 import json
@@ -17,6 +19,7 @@ from ..system.files import is_file
 from .cameras import Camera
 from .images import View, fitted_camera, size_of_image
 from .layout import Layout, PosedImage, hold_out
+from .lens import lens_named
 
 CAMERAS = "cameras.json"
 CFG_ARGS = "cfg_args"  # the options of its training
@@ -51,8 +54,9 @@ def read_model_layout(folder: str, config: TrainConfig) -> Layout:
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "strerror", None) or error
         raise SceneError(f"{path}: not the cameras of a 3DGS model ({reason})") from error
-    if len({camera.name for camera in cameras}) < len(cameras):  # of NeRF-synthetic's training and test views
-        raise SceneError(f"{path}: two cameras have one `img_name`; each must have its own")
+    names = collections.Counter(camera.name for camera in cameras)
+    cameras = [dataclasses.replace(camera, name=f"{camera.name}-{index}") if names[camera.name] > 1 else camera
+               for index, camera in enumerate(cameras)]  # NeRF-synthetic's training and test views share names
     train, test, split = hold_out([PosedImage(camera, "") for camera in cameras], config.test_every)
     if not train:
         raise SceneError(f"{path}: no training camera is left after the split; --test-every 0 keeps none for testing")
@@ -76,14 +80,17 @@ def _camera(entry: Any) -> Camera:
         raise ValueError(f"`rotation` of {entry['img_name']} is not a rotation")
     if not (min(numbers[:2]) > 0 and min(width, height) > 0):
         raise ValueError(f"`width`, `height`, `fx` and `fy` of {entry['img_name']} must be above 0")
-    return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width, height)
+    lens = lens_named(entry["camera_model"], entry.get("distortion", ())) if "camera_model" in entry else None
+    return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width, height, lens)
 
 
 def cameras_content(cameras: Sequence[Camera]) -> List[Dict[str, Any]]:
     """What `cameras.json` holds of cameras, for viewers of 3DGS and for `read_model_layout`."""
     return [{"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height,
              "position": camera.center.tolist(), "rotation": camera.rotation.T.tolist(), "fx": camera.fx,
-             "fy": camera.fy, "cx": camera.cx, "cy": camera.cy} for index, camera in enumerate(cameras)]
+             "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+             **({"camera_model": camera.lens.camera_model, "distortion": camera.lens.coefficients} if camera.lens
+                else {})} for index, camera in enumerate(cameras)]
 
 
 @torch.no_grad()

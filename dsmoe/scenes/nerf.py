@@ -20,7 +20,7 @@ from ..system.files import is_file
 from .cameras import LARGEST, Camera
 from .images import image_size
 from .layout import Layout, PosedImage, hold_out
-from .lens import Lens, lens_of
+from .lens import AROUND, Lens, lens_of
 from .orbit import orbit_of_cameras
 from .pointcloud import SH_C0, PointCloud
 
@@ -196,11 +196,15 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
     # Intrinsics in pixels refer to the size that the json gives, if it gives one.
     json_width, json_height = whole("w", width), whole("h", height)
     given = "fl_x" in frame or "fl_x" in content
-    focal_x = positive("fl_x", 0) if given else _focal(content, frame, json_width, where)
+    model = frame.get("camera_model", content.get("camera_model"))
+    if model == AROUND:
+        focal_x = json_width / (2 * math.pi)  # nothing reads it
+    else:
+        focal_x = positive("fl_x", 0) if given else _focal(content, frame, json_width, where)
     camera = Camera(_name_of(folder, image_path), rotation, -rotation @ matrix[:3, 3], focal_x,
                     positive("fl_y", focal_x), number("cx", json_width / 2), number("cy", json_height / 2),
                     json_width, json_height)
-    lens = _lens(frame.get("camera_model", content.get("camera_model")), content.get("is_fisheye") is True,
+    lens = _lens(model, content.get("is_fisheye") is True,
                  {key: number(key, 0) for key in DISTORTION}, where)
     mask = frame.get("mask_path")
     if mask is None or not is_there:
@@ -216,9 +220,11 @@ def _lens(model: Any, is_fisheye: bool, coefficients: Dict[str, float], where: s
         model = "OPENCV_FISHEYE" if is_fisheye else "OPENCV"
     if model == "OPENCV_FISHEYE":
         return lens_of(model, True, coefficients)
+    if model == AROUND:
+        return Lens(AROUND, False, ())
     if model not in PERSPECTIVE_MODELS:
         raise SceneError(f"{where}: `camera_model` is {reprlib.repr(model)}; it must be one of "
-                         f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE")
+                         f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE, {AROUND}")
     if coefficients.pop("k4"):
         raise SceneError(f"{where}: `k4` is of a fisheye's lens; `camera_model` {model} must have 0 there")
     return lens_of(model, False, coefficients)

@@ -23,7 +23,7 @@ from ..system.process import command
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import MAX_WIDTH, View, fitted_camera, load_views, size_of_image
-from .layout import Layout, PosedImage, with_masks, without_missing
+from .layout import Layout, PosedImage, with_lenses, with_masks, without_missing
 from .modelfolder import CAMERAS, read_model_layout, rendered_views
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
@@ -111,7 +111,8 @@ def read_layout(config: TrainConfig) -> Layout:
     if not layout.train:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split}); "
                          "--test-every 0 keeps none for testing")
-    return with_masks(folder, _checked(folder, layout))
+    layout = with_masks(folder, _checked(folder, layout))
+    return with_lenses(layout) if config.lenses == "native" else layout
 
 
 def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
@@ -127,6 +128,9 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     if scene.start:
         points = f"{count:,} Gaussians of a model"
     lines = [layout.warning, scene.note]
+    models = sorted({view.camera.lens.camera_model for view in [*scene.train, *scene.test] if view.camera.lens})
+    if models:
+        lines.append(f"images of camera model {', '.join(models)} stay as they are; Gaussians are projected through it")
     if config.batch > len(scene.train):
         lines.append(f"note: a step of --batch {config.batch} shows some of the {len(scene.train)} training images "
                      "more than once")
@@ -180,7 +184,8 @@ def _pose(camera: Camera, extent: float) -> bytes:
 
 def _intrinsics(camera: Camera) -> bytes:
     """To a 10,000th of a pixel."""
-    return _rounded([camera.fx, camera.fy, camera.cx, camera.cy], 4)
+    lens = repr((camera.lens.camera_model, camera.lens.coefficients)).encode() if camera.lens else b""
+    return _rounded([camera.fx, camera.fy, camera.cx, camera.cy], 4) + lens
 
 
 def _rounded(values: Sequence[float], digits: int) -> bytes:

@@ -29,7 +29,7 @@ from .images import (
     unreadable,
 )
 from .layout import Layout, PosedImage
-from .lens import Lens
+from .lens import AROUND, THIN_PRISM, Lens
 
 CACHE_VARIABLE = "DSMOE_CACHE"  # a folder for undistorted images, in place of the scene's own
 CACHE_NAME = ".dsmoe_cache"  # of a scene's folder
@@ -74,6 +74,10 @@ def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str
     if not bent:
         return layout, ""
     models = ", ".join(sorted({image.lens.model for image in bent}))
+    unknown = sorted({image.lens.model for image in bent} & {THIN_PRISM, AROUND})
+    if unknown:
+        raise SceneError(f"scene {scene}: OpenCV does not remove the distortion of camera model {unknown[0]}; "
+                         "--lenses native trains through it")
     if not _opencv():
         raise SceneError(f"scene {scene}: {len(bent)} images have lens distortion (camera model {models}); OpenCV "
                          f"removes it: {pip_install('opencv-python-headless')}, then type the same command")

@@ -88,9 +88,6 @@ class NoGraphs:
         """What two steps must have in common so that one graph does for both."""
         return None
 
-    def warm_up(self) -> None:
-        """Steps are launched until the room for their lists is learned anew."""
-
     def find(self, memory: Sequence[Any], kind: Hashable, capture: Callable[[Captured], None]) -> Optional[Captured]:
         """The step of this kind, captured now if need be; None if it has to be launched.
 
@@ -113,9 +110,6 @@ class Graphs(NoGraphs):
         self._seen: Dict[Hashable, None] = {}  # kinds that came before
         self._steps = self._launched = 0
         self._too_many: float = math.inf  # Gaussians, with whose graphs the memory did not suffice
-
-    def warm_up(self) -> None:
-        self._launched = 0
 
     def kind(self, settings: GaussianRasterizationSettings, loss_rule: Hashable, view: View,
              background: Optional[torch.Tensor]) -> Hashable:

@@ -35,8 +35,6 @@ TERMS = 100  # in densify_until_iter, at least, if that has so many steps
 # A view needs a Gaussian if its removal costs more than this there: squared colours, summed over pixels.
 NEEDED_COST = 1e-3
 
-DROPS_UNNEEDED = False  # from a model, before the second step
-
 NEAREST_POINTS = 0.01  # the scene begins behind this part of the points, seen from a camera in any direction
 NUMBERS_AT_ONCE = 2 ** 22  # coordinates of Gaussians, each seen from every camera: 16 MB of them are in memory
 
@@ -82,7 +80,7 @@ class ImportanceStrategy(SteadyStrategy):
         count = self.options.removals
         last = config.iterations - config.batch  # the last step changes nothing
         self.removals = [min(last, round(until * (begin + (REMOVALS_END - begin) * i / count))) for i in range(count)]
-        self.drops_unneeded = is_enough and DROPS_UNNEEDED
+        self.drops_unneeded = is_enough
         interval = max(1, round(until / self.options.pace))
         self.moves_end = round(MOVES_END * until)
         self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
@@ -110,8 +108,10 @@ class ImportanceStrategy(SteadyStrategy):
         nearest = max(1, int(NEAREST_POINTS * len(points)))
         centers = np.stack([view.camera.center for view in self.context.views])
         self.cameras = torch.tensor(centers, dtype=points.dtype, device=points.device)  # [views, 3]
-        begins = [(points - camera).norm(dim=1).kthvalue(nearest).values for camera in self.cameras]
-        self.free_radii = self.options.near * torch.stack(begins)  # [views] world units
+        # Many cameras at once: on a GPU torch finds the kth of one row by one thread block.
+        parts = self.cameras.split(max(1, NUMBERS_AT_ONCE // points.numel()))
+        begins = [(points - part[:, None]).norm(dim=2).kthvalue(nearest, dim=1).values for part in parts]
+        self.free_radii = self.options.near * torch.cat(begins)  # [views] world units
 
     def is_near(self) -> torch.Tensor:
         """[N] which Gaussians float in front of a training camera.
@@ -157,6 +157,11 @@ class ImportanceStrategy(SteadyStrategy):
             part = min(1.0, between / min(self.average_span, terms * between))
             gate = self.context.render.background_gate
             self.context.optimizer.add_to_average(part, gate if isinstance(gate, torch.Tensor) else None)
+
+    @property
+    def looks(self) -> int:
+        """How many training views a decision looks at."""
+        return min(self.options.views, len(self.context.views))
 
     @property
     def densify_until(self) -> int:
@@ -211,8 +216,7 @@ class ImportanceStrategy(SteadyStrategy):
         own = shards.own_rows(mask)
         self.context.optimizer.keep(own)
         shards.settle(torch.zeros_like(own, dtype=torch.long)[own])
-        super()._forget_statistics()
-        self._forget_looks(moves_next=kept == self.context.config.budget)
+        self._forget_statistics()
 
     def move(self) -> None:
         """Moves the cheapest Gaussians to others, drawn by their error, which are split there.
@@ -223,7 +227,7 @@ class ImportanceStrategy(SteadyStrategy):
         self._look_at_the_rest()
         near = self.is_near()
         costs, errors = self.costs.masked_fill(near | self.is_of_few(), 0), self.errors.masked_fill(near, 0)
-        self._forget_looks(moves_next=True)
+        self._forget_looks()
         moves = self.context.shards.decide(self._choose_moves, costs, errors)
         self.split(*moves.unbind(1))
 
@@ -266,8 +270,6 @@ class ImportanceStrategy(SteadyStrategy):
     def looks_at(self, iteration: int, views: Sequence[View]) -> List[int]:
         """Those that the next decision wants: the first of each group, in the last round of the views."""
         removes = self.context.num_gaussians > self.context.config.budget
-        if iteration <= self.context.config.half_until_iter:  # of smaller images costs and errors would be smaller
-            return []
         begun = iteration - self.context.config.batch
         following = next((later for later in [*self.removals, *self.moves] if later > begun), None)
         wanted: List[int] = []
@@ -300,24 +302,23 @@ class ImportanceStrategy(SteadyStrategy):
         super()._forget_statistics()
         self._forget_looks()
 
-    def _forget_looks(self, moves_next: bool = False) -> None:
+    def _forget_looks(self) -> None:
         """Begins new sums, [N], for the next decision, which looks at a view of each group of neighbours."""
         self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
         self.errors = torch.zeros_like(self.view_count)  # the squared error of its pixels, by its share
         self.needed = torch.zeros_like(self.view_count)  # how many of the views need the Gaussian
         views = self.context.views
-        wanted = self.options.move_views if moves_next else 0
-        count = self.looks = min(wanted or self.options.views, len(views))
+        count = self.looks
         first = int(torch.randint(len(views), ()))
         # The group of each view, by name. A look at a view takes out its group.
         self.sought = {views[(first + i) % len(views)].camera.name: i * count // len(views) for i in range(len(views))}
 
     def state_dict(self) -> Dict[str, Any]:
         return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
-                "needed": self.needed, "sought": self.sought, "looks": self.looks}
+                "needed": self.needed, "sought": self.sought}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.start = state["start"]
         self.costs, self.errors, self.needed = state["costs"], state["errors"], state["needed"]
-        self.sought, self.looks = dict(state["sought"]), state["looks"]
+        self.sought = dict(state["sought"])

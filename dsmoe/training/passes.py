@@ -64,9 +64,6 @@ class Passes:
         """Steps the parameters that have not been replaced since `render`."""
         raise NotImplementedError
 
-    def warm_up(self) -> None:
-        """Images have another size from here on."""
-
     def look(self, views: Sequence[View]) -> Iterator[Look]:
         """Renders views beside the steps, and looks at each."""
         for view in views:
@@ -152,9 +149,6 @@ class DirectPasses(Passes):
         self._buffers: Dict[str, torch.Tensor] = {}  # gradients
         # How many steps harmonics may have missed, then the rates of geometry and of harmonics, as the ops take them.
         self._numbers = model.stored["means3D"].new_zeros(1 + 2 * len(PARAMETERS))
-
-    def warm_up(self) -> None:
-        self._graphs.warm_up()
 
     @torch.no_grad()
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()

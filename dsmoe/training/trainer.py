@@ -57,11 +57,11 @@ class Trainer:
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),
             faint_below=config.faint_below, deterministic=config.deterministic)
+        self.renderer.prepare([view.camera for view in self.scene.train])
         self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
             lambda views: self.passes.look(views), self.shards))
         self.order = ViewOrder(len(scene.train), config.seed)
-        self.half_views = [view.halved() for view in self.scene.train] if config.half_until_iter else []
         self.watch = Stopwatch(config.device)
         self.iteration = 0
         self.wants_stop: Callable[[], bool] = lambda: False  # whether this process was asked to stop
@@ -163,14 +163,8 @@ class Trainer:
         return step
 
     def _next_views(self) -> List[ViewOver]:
-        config, every = self.config, self.scene.train
-        if self.half_views:
-            if self.iteration <= config.half_until_iter:
-                every = self.half_views
-            else:
-                self.half_views = []
-                self.passes.warm_up()
-        views = [every[self.order.next()] for _ in range(config.batch)]
+        config = self.config
+        views = [self.scene.train[self.order.next()] for _ in range(config.batch)]
         return [ViewOver(view, torch.rand(3, device=config.device) if config.random_background else None)
                 for view in views]
 

@@ -84,6 +84,35 @@ TEST(ProjectGaussian, BackwardIsTheDerivativeWithAGivenCovariance) {
   expect_backward_is_the_derivative(scene);
 }
 
+TEST(ProjectGaussian, BackwardIsTheDerivativeThroughEveryLens) {
+  for (const Lens<double>& lens : make_lenses(40, 30)) {
+    for (const bool given : {false, true}) {
+      Scene<double> scene = single_gaussian();
+      scene.camera.lens = lens;
+      scene.config.antialiasing = true;
+      if (given) {
+        scene.scales.clear(), scene.rotations.clear();
+        scene.cov3D_precomp = {0.25, 0.05, -0.03, 0.1, 0.02, 0.2};
+      }
+      expect_backward_is_the_derivative(scene);
+    }
+  }
+}
+
+TEST(ProjectGaussian, BeyondTheRangeOfALensIsCulledAndNotFoldedBack) {
+  Scene<double> scene = single_gaussian();
+  const double* view = scene.camera.view;
+  // On the right of the camera, by the camera's own axes.
+  for (int axis = 0; axis < 3; ++axis) scene.means3D[axis] = scene.camera.position[axis] + 2 * view[4 * axis];
+  for (const auto& [distortion, seen] :
+       std::vector<std::pair<std::vector<double>, bool>>{{{}, true}, {{-0.2}, false}}) {
+    scene.camera.lens = lens_of({LensModel::kFisheye, 40, 30, 10, 10, 20, 15, distortion});
+    EXPECT_EQ(project(scene).radius > 0, seen);
+  }
+  scene.camera.lens = {};
+  EXPECT_EQ(project(scene).radius, 0);
+}
+
 TEST(ProjectGaussian, BackwardIsTheDerivativeWithGivenColoursOfAnyNumber) {
   Scene<double> scene = single_gaussian();
   scene.shs.clear();
@@ -279,7 +308,7 @@ TEST(ProjectGaussian, RadiusIsPositiveExactlyWhereTheFootprintMeetsTheImage) {
       }
       const Gaussian<double> gaussian = load_gaussian(scene.inputs(), 0);
       const auto view = transform_point(camera.view, gaussian.mean);
-      const auto conic = covariances(gaussian, camera, view, scene.config.projection_rules()).conic;
+      const auto conic = covariances(gaussian, ByMatrix<double>{camera}, view, scene.config.projection_rules()).conic;
       const auto pixel = project_to_pixel(camera, gaussian.mean);
       bool expected = false;
       if (mode != BlendMode::kSmoeEq7) {  // x range of Inria's rectangle against 3 columns of tiles; y is on the image

@@ -225,7 +225,7 @@ TEST(Refuse, RowsOfABatchFitWhatWasCounted) {
   cuda::ViewBatch on_device;
   on_device.inputs = batch.inputs, on_device.config = batch.config;
   auto& rows = on_device.views.emplace_back();
-  rows.camera = {37, 29, 0.6f, 0.6f, 0.2f, scene.camera.view, scene.camera.projection, scene.camera.position};
+  rows.camera = {37, 29, 0.6f, 0.6f, 0.2f, scene.camera.view, scene.camera.projection, scene.camera.position, {}};
   rows.radii = radii.data(), rows.offsets = offsets.data(), rows.num_rows = 7;  // the host does not read offsets there
   rows.gates = gates, rows.features = features;
   EXPECT_NO_THROW(refuse_rows<cuda::Frame<float>>("cuda::project_rows", on_device, false));

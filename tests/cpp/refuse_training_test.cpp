@@ -1,6 +1,8 @@
 // What the trainers' functions refuse, and what their messages say.
-#include "refuse_training.h"
-
+#include "dsmoe/training/adam.h"
+#include "dsmoe/training/gather.h"
+#include "dsmoe/training/gaussians.h"
+#include "dsmoe/training/image_loss.h"
 #include "dsmoe/training/neighbors.h"
 #include "refusal.h"
 

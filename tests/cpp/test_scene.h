@@ -101,6 +101,18 @@ inline Camera<double> make_camera(int width, int height) {
   return camera;
 }
 
+// Of the same image: one of every kind, of coefficients that bend it well.
+inline std::vector<Lens<double>> make_lenses(int width, int height) {
+  const auto lens = [&](LensModel model, double focal, std::vector<double> distortion) {
+    return lens_of({model, width, height, focal * width, focal * width, 0.53 * width, 0.48 * height, distortion});
+  };
+  return {lens(LensModel::kOrthographic, 0.3, {}),
+          lens(LensModel::kOpencv, 0.8, {-0.2, 0.05, 0.01, -0.02, 0.03, 0.01, 0.02, -0.01, 0.01, -0.005, 0.004, 0.003}),
+          lens(LensModel::kFisheye, 0.4, {0.02, -0.01, 0.003, -0.0002}),
+          lens(LensModel::kThinPrismFisheye, 0.4, {0.02, -0.01, 0.003, -0.002, 0.01, 0.001, 0.02, -0.01}),
+          lens(LensModel::kEquirectangular, 0, {})};
+}
+
 // Odd seeds have a gate for the background. Gaussians around the origin: some off the image or behind the camera, some
 // more than opaque, some not there at all.
 inline Scene<double> make_scene(unsigned seed, int count, int width, int height) {
@@ -129,6 +141,7 @@ template <class To, class From> Scene<To> convert(const Scene<From>& from) {
   to.camera.width = from.camera.width, to.camera.height = from.camera.height;
   to.camera.tan_fov_x = To(from.camera.tan_fov_x), to.camera.tan_fov_y = To(from.camera.tan_fov_y);
   to.camera.near = To(from.camera.near);
+  to.camera.lens = from.camera.lens.template as<To>();
   to.config.blend = from.config.blend.template as<To>();
   to.config.num_channels = from.config.num_channels;
   to.config.scale_modifier = To(from.config.scale_modifier);

@@ -15,6 +15,7 @@ from diff_smoe_rasterization.settings import (
     GaussianRasterizationSettings,
     resolve_background_gate,
     resolve_faint_below,
+    resolve_lens,
 )
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
@@ -193,7 +194,9 @@ def op_arguments(scene, op="rasterize", **others):
     mode = scene.settings.blend_mode
     gate = resolve_background_gate(mode, scene.settings.background_gate)
     learned = isinstance(gate, torch.Tensor)
-    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode),
+    camera_model, lens = resolve_lens(scene.settings)
+    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode), "camera_model": camera_model,
+              "lens": lens,
               "faint_below": resolve_faint_below(mode, scene.settings.faint_below),
               **dict.fromkeys(FEATURE_OUTPUTS, True),
               "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,

@@ -70,6 +70,14 @@ def test_further_images_are_written(model, tmp_path):
     assert 0.2 < nearest < farthest < 12, "within the room, which is 8 units wide"
 
 
+def test_two_apis_render_the_same_image(tmp_path):
+    text = run("other_apis.py", folder=tmp_path)
+    seen, difference = re.fullmatch(r"(\d+) of 500 Gaussians are seen; the two images differ by (\S+) on average\n",
+                                    text).groups()
+    # float32 sums of some hundred terms, some of whose pairs lie at a cut-off.
+    assert int(seen) > 400 and float(difference) < 1e-4
+
+
 def test_scores_tell_which_gaussians_matter(model, tmp_path):
     text = run("scores.py", model[0], folder=tmp_path)
     best, any_ = map(float, re.findall(r"([\d.]+) dB", text))

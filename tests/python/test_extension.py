@@ -21,9 +21,11 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.core import _core
+from diff_smoe_rasterization.footprints import image_numbers
 from diff_smoe_rasterization.settings import (
     _FIXED_GATES,
     BLEND_MODES,
+    CAMERA_MODELS,
     FEATURE_OUTPUTS,
     OUTPUTS,
     GaussianRasterizationSettings,
@@ -178,8 +180,8 @@ def test_build_info_tells_what_runs():
 
 def test_the_settings_and_the_op_have_the_same_fields():
     """A setting is a line of csrc/torch/fields.h and a field of this name; these options are not settings."""
-    options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward"}
-    fields = set(GaussianRasterizationSettings._fields)
+    options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward", "lens"}
+    fields = set(GaussianRasterizationSettings._fields) - {"distortion", "principal_point"}  # which are `lens`
     assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
     assert fields - options <= set(_core.inputs) and options <= fields
 
@@ -190,6 +192,10 @@ def test_the_blend_modes_have_the_numbers_and_the_background_gates_of_the_core()
     assert {name: facts["background_gate"] for name, facts in modes.items()} == _FIXED_GATES
     below = {mode: resolve_faint_below(mode, None) for mode in BLEND_MODES}
     assert {name: round(facts["faint_below"], 6) for name, facts in modes.items()} == below  # a float32
+
+
+def test_the_camera_models_have_the_numbers_of_the_core():
+    assert _core.camera_models == CAMERA_MODELS
 
 
 @on_every_device
@@ -350,7 +356,7 @@ def every_call():
     inputs = {name: backward[name] for name in ("inputs", "present")}
     belongs = [here and name not in ("bg", "background_gate") for name, here in zip(_core.inputs, inputs["present"])]
     camera = [scene.settings.viewmatrix, scene.settings.projmatrix, scene.settings.campos]
-    view = {"cameras": camera, "images": [20.0, 18.0, 1.0, 1.0], "depth": False, "inverse_depth": False}
+    view = {"cameras": camera, "images": image_numbers(scene.settings), "depth": False, "inverse_depth": False}
     counted = {"radii": torch.zeros(1, 20, dtype=torch.int32), "offsets": torch.tensor([[0, 1]], dtype=torch.int32)}
     wide = torch.zeros(1, 4)
     depth = random_normal((20,), 1, torch.float32)

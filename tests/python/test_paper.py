@@ -36,6 +36,16 @@ def test_each_piece_of_the_paper_has_a_row_with_a_command(first):
     assert re.search(r"`(dsmoe|--blend-mode)", row)
 
 
+def test_every_command_of_the_readme_is_one():
+    from dsmoe.arguments import build_parser
+
+    typed = [" ".join(words).split(" && ") for words in commands((ROOT / "README.md").read_text(encoding="utf-8"))
+             if words[0] == "dsmoe" and len(words) > 2]  # a name is no command
+    assert len(typed) > 10
+    for command in (command for line in typed for command in line):
+        build_parser().parse_args(command.split()[1:])
+
+
 def test_every_command_of_the_map_is_one():
     from dsmoe.arguments import build_parser
     from dsmoe.bench.names import SCENES, SHIPPED
@@ -119,6 +129,6 @@ def test_the_edge_has_the_figures_of_the_pages(tmp_path):
     by_picture = [float(value) for value in re.findall(r"([\d.]+) dB", run("edge.py", folder=tmp_path))[:2]]
     assert said == pytest.approx(by_picture, abs=0.3)
     rules = [float(value) for value in re.findall(r"([\d.]+) dB", run("edge.py", "--rules", folder=tmp_path))]
-    rows = rows_of(PAPER.read_text(encoding="utf-8"), "(?:0.25|1)")
+    rows = rows_of(PAPER.read_text(encoding="utf-8"), r"(?:0\.25|1), 600")
     of_page = [float(value) for row in rows for value in re.findall(r"\d\d\.\d", row)]
     assert len(rules) == len(of_page) == 8 and of_page == pytest.approx(rules, abs=0.5)

@@ -75,14 +75,14 @@ def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
 # Words of each page (`wc -w`) that its reader can be asked to read. A page that needs more takes them from another.
 WORDS = {
     "README.md": 1200, "CHANGELOG.md": 50, "CONTRIBUTING.md": 160, "DEVELOPING.md": 3050, "benchmarks/NOTES.md": 3450,
-    "benchmarks/README.md": 1000, "benchmarks/RESULTS.md": 2000, "benchmarks/harness/report/table.md": 80,
-    "benchmarks/timing/README.md": 380, "docs/cpp.md": 850, "docs/cuda.md": 1350, "docs/distributed.md": 900,
+    "benchmarks/README.md": 960, "benchmarks/RESULTS.md": 2000, "benchmarks/harness/report/table.md": 80,
+    "benchmarks/timing/README.md": 380, "docs/cpp.md": 760, "docs/cuda.md": 1350, "docs/distributed.md": 900,
     "docs/install.md": 850, "docs/look.md": 650, "docs/method.md": 1500, "docs/paper.md": 1300, "docs/scenes.md": 650,
     "docs/settings.md": 1850, "docs/simplify.md": 530, "docs/site/python.md": 110, "docs/start.md": 350,
     "docs/tools.md": 450, "docs/trainer.md": 1350, "docs/trainers.md": 630, "docs/usage.md": 1450,
-    "examples/README.md": 180, "examples/libtorch/README.md": 200, "integrations/README.md": 1180,
+    "examples/README.md": 210, "examples/libtorch/README.md": 200, "integrations/README.md": 980,
     "patches/README.md": 1200}
-ALL_WORDS = 30200  # of all pages together; the sum of WORDS is what they come down to
+ALL_WORDS = 30500  # of all pages together; the sum of WORDS is what they come down to
 
 
 def test_the_pages_together_stay_short(stage):
@@ -210,7 +210,8 @@ def test_the_page_of_settings_has_every_variable():
                 read.update(re.findall(r'(?:getenv\(|environ\.get\(|environ\[|VARIABLE = |DEMO = |'
                                        r'"(?:vgg|alex)": )"(DSMOE_\w+)"', text))
                 read.update(re.findall(r"\$\{?(DSMOE_\w+)", text) if path.suffix in ("", ".sh", ".yaml") else ())
-    said = {name for names, *_ in settings_tables()["The environment"] for name in names if name.startswith("DSMOE_")}
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    said = set(re.findall(r"`(DSMOE_\w+)`", page.partition("## The environment")[2]))
     assert said == read - {"DSMOE_X"}
 
 

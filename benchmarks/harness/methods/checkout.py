@@ -50,8 +50,8 @@ class ThreeDGS:
     observed: Tuple[str, ...] = ()  # further arguments of the observer
     render_arguments: Tuple[str, ...] = ()
     container = "point_cloud.ply"
-    of_gaussians = True  # as those of 3DGS are, with SH colours
-    trains_with_arguments = True  # the method's are those of train.py
+    of_gaussians = True  # as in 3DGS, with SH colours
+    trains_with_arguments = True  # the method's arguments go to train.py
 
     def __init__(self, cell: Dict[str, Any], config: TrainConfig, output: str) -> None:
         self.cell, self.config, self.output = cell, config, os.path.abspath(output)
@@ -169,7 +169,7 @@ class C3DGS(ThreeDGS):
 
     stubs = ("lpips",)  # compress.py measures it, with weights that it would download
     container = "point_cloud.npz"
-    trains_with_arguments = False  # they are those of compress.py
+    trains_with_arguments = False  # they go to compress.py
 
     def train(self) -> Dict[str, Any]:
         self.model = os.path.join(self.output, "run", "base")

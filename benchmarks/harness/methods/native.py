@@ -34,7 +34,7 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     scene = scene_of(config).to(config.device)
     gpus = cell["protocol"].get("gpus", 1)
     row = train_on(gpus, config) if gpus > 1 else train(config, resume=True, progress=False, scene=scene)
-    # The peak of a part of the training would be taken for that of the whole.
+    # Else the peak of one part would be taken for the whole training's.
     peak = torch.cuda.max_memory_allocated() / 2**20 if on_gpu and gpus == 1 and not continued else None
     measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, since LPIPS takes memory
     ply, history = model_path(folder, config.iterations), os.path.join(folder, HISTORY_NAME)

@@ -58,7 +58,7 @@ template <class S, BlendMode kMode, int kSums, int kPixels, bool kWide> struct B
     if constexpr (kInSegments) begin_segments(position);
   }
 
-  // Begins the segments up to that of the entry at `position`, and queues them for the backward pass.
+  // Begins all segments up to the entry at `position`, and queues them for the backward pass.
   __device__ __forceinline__ void begin_segments(int32_t position) {
     for (; next_segment <= position; next_segment += kSegmentLength) {
       const int segment = next_segment / kSegmentLength;

@@ -16,7 +16,7 @@ constexpr unsigned kAllLanes = 0xffffffffu;
 inline unsigned blocks_for(int64_t items, int block) { return static_cast<unsigned>((items + block - 1) / block); }
 
 // Copies the camera to shared memory; all threads of the block take part. No barrier.
-template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Camera<S>& to) {
+template <class S> __device__ void load_camera(const DeviceCamera<S>& from, PinholeCamera<S>& to) {
   for (int i = threadIdx.x; i < 16; i += blockDim.x) to.view[i] = from.view[i], to.projection[i] = from.projection[i];
   for (int i = threadIdx.x; i < 3; i += blockDim.x) to.position[i] = from.position[i];
   if (threadIdx.x == 0) {
@@ -25,6 +25,18 @@ template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Came
     to.near = from.near;
   }
 }
+template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Camera<S>& to) {
+  load_camera<S>(from, static_cast<PinholeCamera<S>&>(to));
+  if (threadIdx.x == 0) to.lens = from.lens;
+}
+
+// Calls body(TypeOf<PinholeCamera<S>>) or, if there is a lens, body(TypeOf<Camera<S>>): a kernel for pinholes alone
+// needs less registers.
+template <class T> struct TypeOf { using type = T; };
+template <class S, class Body> void dispatch_camera(bool lens, const Body& body) {
+  lens ? body(TypeOf<Camera<S>>{}) : body(TypeOf<PinholeCamera<S>>{});
+}
+template <class S> bool has_lens(const DeviceCamera<S>& camera) { return camera.lens.model != LensModel::kPinhole; }
 
 // Multiprocessors of the current device.
 inline int num_multiprocessors() {

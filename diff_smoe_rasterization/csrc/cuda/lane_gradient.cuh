@@ -6,7 +6,7 @@
 namespace dsmoe {
 namespace cuda {
 
-// The gradients of a lane's Gaussian, but for those of its SH row.
+// The gradients of a lane's Gaussian, except by its SH row.
 struct LaneGradient {
   GaussianGradient<float> gaussian;
   float dc[3];  // if degree 0 lies apart

@@ -148,7 +148,7 @@ template <class S> struct TestArguments {
   SavedForward<S> saved;     // projected is read
   const int32_t* radii;      // [N] pixels
   BlendMode mode;            // decides the bounds of footprints
-  TileGrid image, tiles;     // all tiles, and those of the band
+  TileGrid image, tiles;     // all tiles; the band's
   int macro_columns;
   S tail_reach;           // of BlendRules
   bool near_first;        // squares are those that near pairs meet

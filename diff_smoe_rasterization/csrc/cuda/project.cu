@@ -63,9 +63,9 @@ template <class S> void order_nothing(const Frame<S>& frame, cudaStream_t stream
   check(cudaMemsetAsync(frame.saved.num_ordered, 0, sizeof(int64_t), stream), "projecting Gaussians");
 }
 
-template <class S, int kFeatures, class Rows>
+template <class AnyCamera, class S, int kFeatures, class Rows>
 __global__ void __launch_bounds__(kRowsBlock) project_kernel(const __grid_constant__ ProjectArguments<S> arguments) {
-  __shared__ Camera<S> camera;
+  __shared__ AnyCamera camera;
   extern __shared__ float4 shared_rows[];
   const GaussianInputs<S>& inputs = arguments.inputs;
   const RasterConfig<S>& config = arguments.config;
@@ -130,15 +130,15 @@ template <class S> struct RadiiArguments {
   int32_t* radii;            // [N] pixels, written
 };
 
-template <class S>
+template <class AnyCamera, class S>
 __global__ void __launch_bounds__(kRowsBlock) radii_kernel(const __grid_constant__ RadiiArguments<S> arguments) {
-  __shared__ Camera<S> camera;
+  __shared__ AnyCamera camera;
   load_camera(arguments.camera, camera);
   __syncthreads();
   const int64_t i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
   if (i >= arguments.inputs.num_gaussians) return;
   S features[kMostHeldFeatures];
-  arguments.radii[i] = project_gaussian<S>({arguments.inputs, camera, arguments.config, i}, features).radius;
+  arguments.radii[i] = project_gaussian<S, AnyCamera>({arguments.inputs, camera, arguments.config, i}, features).radius;
 }
 
 template <class S> struct VisibleArguments {
@@ -146,6 +146,7 @@ template <class S> struct VisibleArguments {
   const S* means3D;       // [N, 3] world
   const S* view;          // [4, 4] as Camera has it
   S near;                 // view depth; what is not beyond is not visible
+  LensModel lens;         // which says what a depth is
   bool* visible;          // [N] written
 };
 
@@ -154,7 +155,8 @@ __global__ void __launch_bounds__(kStoreBlock)
     mark_visible_kernel(const __grid_constant__ VisibleArguments<S> arguments) {
   const int64_t i = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
   if (i >= arguments.num_gaussians) return;
-  arguments.visible[i] = transform_point(arguments.view, load3(arguments.means3D + 3 * i)).z > arguments.near;
+  const Vec3<S> view = transform_point(arguments.view, load3(arguments.means3D + 3 * i));
+  arguments.visible[i] = view_depth(arguments.lens, view) > arguments.near;
 }
 
 }  // namespace
@@ -169,16 +171,21 @@ template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, con
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
   arguments.order = order_targets(frame, depths);
-  dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
-    using Rows = typename decltype(type)::type;
-    const auto launch = [&](auto kernel) {
-      kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, work.stream>>>(arguments);
-      DSMOE_CHECK_LAUNCH("project");
-    };
-    if constexpr (Rows::kStaged) {
-      if (frame.config.num_features() == kFastFeatures) return launch(project_kernel<S, kFastFeatures, Rows>);
-    }
-    launch(project_kernel<S, kAnyFeatures, Rows>);
+  dispatch_camera<S>(has_lens(frame.camera), [&](auto camera) {
+    using AnyCamera = typename decltype(camera)::type;
+    dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
+      using Rows = typename decltype(type)::type;
+      const auto launch = [&](auto kernel) {
+        kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, work.stream>>>(arguments);
+        DSMOE_CHECK_LAUNCH("project");
+      };
+      if constexpr (Rows::kStaged) {
+        if (frame.config.num_features() == kFastFeatures) {
+          return launch(project_kernel<AnyCamera, S, kFastFeatures, Rows>);
+        }
+      }
+      launch(project_kernel<AnyCamera, S, kAnyFeatures, Rows>);
+    });
   });
 }
 
@@ -197,8 +204,11 @@ template <class S> void project_radii(const Frame<S>& frame, const Work& work) {
   const int64_t count = frame.inputs.num_gaussians;
   if (count == 0) return;
   const RadiiArguments<S> arguments = {frame.inputs, frame.camera, frame.config, frame.images.radii};
-  radii_kernel<<<blocks_for(count, kRowsBlock), kRowsBlock, 0, work.stream>>>(arguments);
-  DSMOE_CHECK_LAUNCH("radii");
+  dispatch_camera<S>(has_lens(frame.camera), [&](auto camera) {
+    using AnyCamera = typename decltype(camera)::type;
+    radii_kernel<AnyCamera><<<blocks_for(count, kRowsBlock), kRowsBlock, 0, work.stream>>>(arguments);
+    DSMOE_CHECK_LAUNCH("radii");
+  });
 }
 
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work) {
@@ -208,6 +218,7 @@ template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const
   arguments.means3D = frame.inputs.means3D;
   arguments.view = frame.camera.view;
   arguments.near = frame.camera.near;
+  arguments.lens = frame.camera.lens.model;
   arguments.visible = visible;
   if (arguments.num_gaussians == 0) return;
   const unsigned blocks = blocks_for(arguments.num_gaussians, kStoreBlock);

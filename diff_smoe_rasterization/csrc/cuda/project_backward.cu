@@ -61,10 +61,10 @@ using RecordRows = WarpRows<kRecordLength>;
 
 // The common case. The SH rows come through shared memory. So do the records if they are of colours only. All other
 // numbers live in registers.
-template <bool kCamera, bool kOnlyColors, class Rows>
+template <class AnyCamera, bool kCamera, bool kOnlyColors, class Rows>
 __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : kRowsBackwardBlocks)
     known_backward_kernel(const __grid_constant__ ProjectBackwardArguments<float> arguments) {
-  __shared__ Camera<float> camera;
+  __shared__ AnyCamera camera;
   extern __shared__ float4 shared_rows[];
   const int64_t count = arguments.inputs.num_gaussians, i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
@@ -124,10 +124,10 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
 }
 
 // Every other case. Staged SH rows leave their gradients in the same place.
-template <class S, bool kCamera, class Rows>
+template <class AnyCamera, class S, bool kCamera, class Rows>
 __global__ void __launch_bounds__(kRowsBlock)
     project_backward_kernel(const __grid_constant__ ProjectBackwardArguments<S> arguments) {
-  __shared__ Camera<S> camera;
+  __shared__ AnyCamera camera;
   extern __shared__ float4 shared_rows[];
   load_camera(arguments.camera, camera);
   __syncthreads();
@@ -239,25 +239,28 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
   if (inputs.num_gaussians > 0) {
     const bool aligned = are_vector_aligned(dL_dgaussians, gradients.shs, gradients.dc, gradients.means3D,
                                             gradients.means2D, gradients.scales, gradients.rotations);
-    dispatch_sh_rows(inputs, aligned, [&](auto type, size_t shared) {
-      using Rows = typename decltype(type)::type;
-      const auto launch = [&](auto kernel, size_t shared_bytes) {
-        kernel<<<static_cast<unsigned>(blocks), kRowsBlock, shared_bytes, stream>>>(arguments);
-        DSMOE_CHECK_LAUNCH("project_backward");
-      };
-      if constexpr (Rows::kKnown) {
-        shared += sizeof(float) * kRowsBlock * RecordRows::stride(kRecordLength);
-        if (config.num_features() == kFastFeatures) {
-          with_camera ? launch(known_backward_kernel<true, true, Rows>, shared)
-                      : launch(known_backward_kernel<false, true, Rows>, shared);
+    dispatch_camera<S>(has_lens(frame.camera), [&](auto camera) {
+      using AnyCamera = typename decltype(camera)::type;
+      dispatch_sh_rows(inputs, aligned, [&](auto type, size_t shared) {
+        using Rows = typename decltype(type)::type;
+        const auto launch = [&](auto kernel, size_t shared_bytes) {
+          kernel<<<static_cast<unsigned>(blocks), kRowsBlock, shared_bytes, stream>>>(arguments);
+          DSMOE_CHECK_LAUNCH("project_backward");
+        };
+        if constexpr (Rows::kKnown) {
+          shared += sizeof(float) * kRowsBlock * RecordRows::stride(kRecordLength);
+          if (config.num_features() == kFastFeatures) {
+            with_camera ? launch(known_backward_kernel<AnyCamera, true, true, Rows>, shared)
+                        : launch(known_backward_kernel<AnyCamera, false, true, Rows>, shared);
+          } else {
+            with_camera ? launch(known_backward_kernel<AnyCamera, true, false, Rows>, shared)
+                        : launch(known_backward_kernel<AnyCamera, false, false, Rows>, shared);
+          }
         } else {
-          with_camera ? launch(known_backward_kernel<true, false, Rows>, shared)
-                      : launch(known_backward_kernel<false, false, Rows>, shared);
+          with_camera ? launch(project_backward_kernel<AnyCamera, S, true, Rows>, shared)
+                      : launch(project_backward_kernel<AnyCamera, S, false, Rows>, shared);
         }
-      } else {
-        with_camera ? launch(project_backward_kernel<S, true, Rows>, shared)
-                    : launch(project_backward_kernel<S, false, Rows>, shared);
-      }
+      });
     });
   }
   if (with_camera) {

@@ -37,8 +37,6 @@ template <bool kStagedRows, int kRowLength> struct ShRows : WarpRows<kRowLength>
   }
 };
 
-template <class T> struct TypeOf { using type = T; };
-
 template <class... T> bool are_vector_aligned(const T*... pointers) {
   return ((reinterpret_cast<std::uintptr_t>(pointers) % 16 == 0) && ...);
 }

@@ -6,6 +6,7 @@
 #include "dsmoe/arrays.h"
 #include "dsmoe/blend.h"
 #include "dsmoe/constants.h"
+#include "dsmoe/lens.h"
 #include "dsmoe/rasterize.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "dsmoe/removal.h"
@@ -27,6 +28,7 @@ py::dict constants() {
   out["gate_cut"] = kGateCut;
   out["core_kernel"] = kCoreKernel;
   out["most_views"] = kMostViews;
+  out["most_lens_numbers"] = 2 + kMostDistortion;
   out["core_alpha"] = kCoreAlpha;
   out["tail_alpha"] = kTailAlpha;
   out["every_tail_alpha"] = kEveryTailAlpha;
@@ -130,6 +132,8 @@ PYBIND11_MODULE(_core, module) {
   py::register_exception_translator(&python::translate_exception);
   module.attr("constants") = constants();
   module.attr("blend_modes") = blend_modes();
+  module.attr("camera_models") =
+      py::tuple(py::cast(std::vector<std::string>(std::begin(kLensNames), std::end(kLensNames))));
   module.attr("inputs") = inputs();
   module.attr("images") = images();
   module.attr("options") = options();

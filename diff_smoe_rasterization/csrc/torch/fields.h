@@ -23,27 +23,29 @@
 
 // The others: X(type in C++, type in the schema, name). They mean what the field of that name means in settings.py.
 // for_backward stays the last one: callers in Python append it.
-#define DSMOE_OPTIONS(X)                                                   \
-  X(int64_t, "SymInt", image_height)                                       \
-  X(int64_t, "SymInt", image_width)                                        \
-  X(double, "float", tanfovx)                                              \
-  X(double, "float", tanfovy)                                              \
-  X(double, "float", scale_modifier)                                       \
-  X(double, "float", near)                                                 \
-  X(double, "float", alpha_min)                                            \
-  X(double, "float", faint_below)                                          \
-  X(double, "float", low_pass)                                             \
-  X(double, "float", fixed_background_gate) /* where no tensor is given */ \
-  X(int64_t, "int", sh_degree)                                             \
-  X(int64_t, "int", blend_mode) /* its number */                           \
-  X(bool, "bool", antialiasing)                                            \
-  X(bool, "bool", depth)         /* whether that image is wanted */        \
-  X(bool, "bool", inverse_depth) /* whether that image is wanted */        \
-  X(bool, "bool", deterministic)                                           \
-  X(bool, "bool", debug)                                                   \
-  X(bool, "bool", clamp_color)                                             \
-  X(bool, "bool", strict)                                                  \
-  X(bool, "bool", prefiltered)                                             \
+#define DSMOE_OPTIONS(X)                                                                            \
+  X(int64_t, "SymInt", image_height)                                                                \
+  X(int64_t, "SymInt", image_width)                                                                 \
+  X(double, "float", tanfovx)                                                                       \
+  X(double, "float", tanfovy)                                                                       \
+  X(double, "float", scale_modifier)                                                                \
+  X(double, "float", near)                                                                          \
+  X(double, "float", alpha_min)                                                                     \
+  X(double, "float", faint_below)                                                                   \
+  X(double, "float", low_pass)                                                                      \
+  X(double, "float", fixed_background_gate) /* where no tensor is given */                          \
+  X(int64_t, "int", sh_degree)                                                                      \
+  X(int64_t, "int", blend_mode)           /* its number */                                          \
+  X(int64_t, "int", camera_model)         /* its number */                                          \
+  X(std::vector<double>, "float[]", lens) /* principal point and distortion; empty for a pinhole */ \
+  X(bool, "bool", antialiasing)                                                                     \
+  X(bool, "bool", depth)         /* whether that image is wanted */                                 \
+  X(bool, "bool", inverse_depth) /* whether that image is wanted */                                 \
+  X(bool, "bool", deterministic)                                                                    \
+  X(bool, "bool", debug)                                                                            \
+  X(bool, "bool", clamp_color)                                                                      \
+  X(bool, "bool", strict)                                                                           \
+  X(bool, "bool", prefiltered)                                                                      \
   X(bool, "bool", for_backward) /* whether a backward pass may follow; else what only makes it faster is left out */
 
 // The images on request, [1, H, W], or [0] if the option of that name is not set: X(enumerator, name). Each is of a

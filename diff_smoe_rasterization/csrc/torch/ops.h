@@ -9,53 +9,10 @@
 #include <string_view>
 #include <vector>
 
-#include "checks.h"
-#include "tensors.h"
+#include "op.h"
 
 namespace dsmoe {
 namespace binding {
-
-inline Inputs read_inputs(Arguments& arguments) {
-  Inputs inputs;
-  const auto read = [&](std::string_view schema, Tensor& value) {
-    schema == "Tensor?" ? arguments.read_optional(value) : arguments.read(value);
-  };
-#define DSMOE_READ(enumerator, schema, name, ...) read(schema, inputs[enumerator]);
-  DSMOE_INPUTS(DSMOE_READ)
-#undef DSMOE_READ
-  return inputs;
-}
-
-inline Options read_options(Arguments& arguments) {
-  Options options;
-#define DSMOE_READ(type, schema, name) arguments.read(options.name);
-  DSMOE_OPTIONS(DSMOE_READ)
-#undef DSMOE_READ
-  return options;
-}
-
-inline Tensor read_optional(Arguments& arguments) {
-  Tensor value;
-  arguments.read_optional(value);
-  return value;
-}
-
-// What a rendering saved, each array at a multiple of what a kernel loads at once. Torch's own memory is; what a hook
-// of autograd hands back may lie anywhere, and is copied.
-inline Saved read_saved(Arguments& arguments) {
-  constexpr size_t kLargestVector = 32;  // bytes: SegmentPixel<double>
-  auto saved = arguments.read<Saved>();
-  for (Tensor& array : saved) {
-    const bool given = array.defined() && array.numel() > 0;
-    if (given && reinterpret_cast<uintptr_t>(array.data_ptr()) % kLargestVector != 0) array = array.clone();
-  }
-  return saved;
-}
-
-// Calls body(S()) with the type of `like`, as the op `function`.
-template <class Body> void dispatch(const char* function, const Tensor& like, Body body) {
-  as_op(function, [&] { dispatch_real(like, body); });
-}
 
 // What an op that projects asks of the values of its arguments. Returns them dense.
 template <class Backend> Inputs checked(const char* function, const Inputs& inputs, const Options& options) {
@@ -67,7 +24,8 @@ template <class Backend> Inputs checked(const char* function, const Inputs& inpu
   const Inputs dense = contiguous(inputs);
   if (options.strict) refuse_non_finite(function, dense);
   if (options.prefiltered) {
-    refuse_culled(function, dense, Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], options.near));
+    refuse_culled(function, dense,
+                  Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], options.near, options.camera_model));
   }
   return dense;
 }
@@ -354,92 +312,7 @@ template <class Backend> void project_backward(Arguments& arguments) {
   arguments.give_back(std::move(results));
 }
 
-template <class Backend> void contributions(Arguments& arguments) {
-  const auto pixel_weights = arguments.read<Tensor>();
-  const auto radii = arguments.read<Tensor>();
-  const Saved saved = read_saved(arguments);
-  const Tensor background_gate = read_optional(arguments);
-  const auto options = read_options(arguments);
-  const Expect expect = check_saved("contributions", radii, saved, background_gate, options);
-  expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
-  const typename Backend::Guard guard(radii.device());
-  const auto real = [&] { return empty({radii.numel()}, pixel_weights); };
-  const Tensor weights = real(), pixels = empty_like(radii), blend_weights = real(), distances = real();
-  const Tensor map = pixel_weights.contiguous();
-  dispatch("contributions", map, [&](auto zero) {
-    using S = decltype(zero);
-    ContributionSums<S> sums;
-    sums.pixel_weights = mutable_data<S>(weights);
-    sums.pixels = mutable_data<int32_t>(pixels);
-    sums.blend_weights = mutable_data<S>(blend_weights);
-    sums.distances = mutable_data<S>(distances);
-    Backend::template contributions<S>(expect, map, radii, saved, blend_config<S>(background_gate, options), options,
-                                       sums);
-  });
-  arguments.give_back(weights, pixels, blend_weights, distances);
-}
-
-template <class Backend> void importance(Arguments& arguments) {
-  const auto pixel_weights = arguments.read<Tensor>();
-  Tensor share_weights, color, gate_sum, background;
-  for (auto* image : {&share_weights, &color, &gate_sum, &background}) arguments.read(*image);
-  const auto radii = arguments.read<Tensor>();
-  const Saved saved = read_saved(arguments);
-  const Tensor background_gate = read_optional(arguments);
-  const auto options = read_options(arguments);
-  const Expect expect = check_saved("importance", radii, saved, background_gate, options);
-  expect("pixel_weights", pixel_weights, {options.image_height, options.image_width});
-  const int64_t height = options.image_height, width = options.image_width;
-  expect("share_weights", share_weights, {height, width});
-  expect("color", color, {"C", height, width});
-  expect("gate_sum", gate_sum, {1, height, width});
-  expect("bg", background, {color.size(0)});
-  const typename Backend::Guard guard(radii.device());
-  const auto sums = [&] { return empty({radii.numel()}, pixel_weights); };
-  const Tensor shares = sums(), squared_shares = sums(), removal_costs = sums();
-  const Tensor weights = pixel_weights.contiguous();
-  for (auto* image : {&share_weights, &color, &gate_sum, &background}) *image = image->contiguous();
-  dispatch("importance", weights, [&](auto zero) {
-    using S = decltype(zero);
-    RasterConfig<S> config = blend_config<S>(background_gate, options);
-    config.num_channels = static_cast<int>(color.size(0));
-    config.background = data<S>(background);
-    ask_for_features(config, options);
-    ImportanceMap<S> map;
-    map.color = data<S>(color);
-    map.pixel_weights = data<S>(weights);
-    map.share_weights = data<S>(share_weights);
-    map.sums.shares = mutable_data<S>(shares);
-    map.sums.squared_shares = mutable_data<S>(squared_shares);
-    map.sums.removal_costs = mutable_data<S>(removal_costs);
-    Backend::template importance<S>(expect, gate_sum, radii, saved, config, options, map);
-  });
-  arguments.give_back(shares, squared_shares, removal_costs);
-}
-
-template <class Backend> void gate_map(Arguments& arguments) {
-  auto gate_sum = arguments.read<Tensor>();
-  const auto radii = arguments.read<Tensor>();
-  const Saved saved = read_saved(arguments);
-  const Tensor background_gate = read_optional(arguments);
-  const auto options = read_options(arguments);
-  const Expect expect = check_saved("gate_map", radii, saved, background_gate, options);
-  expect("gate_sum", gate_sum, {1, options.image_height, options.image_width});
-  const typename Backend::Guard guard(radii.device());
-  const auto image = [&] { return empty({options.image_height, options.image_width}, radii, kInt); };
-  const Tensor gaussians = image(), counts = image(), medians = image();
-  gate_sum = gate_sum.contiguous();
-  dispatch("gate_map", saved[0], [&](auto zero) {
-    using S = decltype(zero);
-    const GateMap map = {mutable_data<int32_t>(gaussians), mutable_data<int32_t>(counts),
-                         mutable_data<int32_t>(medians)};
-    Backend::template gate_map<S>(expect, gate_sum, radii, saved, blend_config<S>(background_gate, options), options,
-                                  map);
-  });
-  arguments.give_back(gaussians, counts, medians);
-}
-
-// The arguments of an op on a batch of views: those of its first view, and all cameras.
+// The arguments of an op on a batch of views: its first view's, and all cameras.
 struct BatchArguments {
   explicit BatchArguments(Arguments& arguments)
       : inputs(read_inputs(arguments)),
@@ -459,7 +332,7 @@ struct BatchArguments {
     const auto type = inputs[kMeans3D].scalar_type();
     DSMOE_CHECK_TYPE(type == kFloat, function, ": means3D is ", dtype_name(type), "; it must be float32");
     for (int64_t v = 0; v < num_views(); ++v) {
-      take_view(v);
+      take_view(function, v);
       check_arguments(function, inputs, options);
     }
     return inputs[kMeans3D].device();
@@ -469,12 +342,14 @@ struct BatchArguments {
   template <class Backend> typename Backend::ViewBatch batch(const char* function) {
     typename Backend::ViewBatch batch;
     for (int64_t v = 0; v < num_views(); ++v) {
-      take_view(v);
+      take_view(function, v);
       inputs = checked<Backend>(function, inputs, options);
       kept.insert(kept.end(), inputs.begin() + kViewMatrix, inputs.begin() + kViewMatrix + kTensorsOfCamera);
-      const auto frame = Backend::template frame_of_gaussians<float>(inputs, options, Images());
-      batch.inputs = frame.inputs, batch.config = frame.config;
-      batch.views.emplace_back().camera = frame.camera;
+      as_op(function, [&] {
+        const auto frame = Backend::template frame_of_gaussians<float>(inputs, options, Images());
+        batch.inputs = frame.inputs, batch.config = frame.config;
+        batch.views.emplace_back().camera = frame.camera;
+      });
     }
     return batch;
   }
@@ -508,14 +383,18 @@ struct BatchArguments {
   }
 
   // Puts the camera and the image of a view among the arguments.
-  void take_view(int64_t v) {
+  void take_view(const char* function, int64_t v) {
     std::copy_n(cameras.begin() + v * kTensorsOfCamera, kTensorsOfCamera, inputs.begin() + kViewMatrix);
     const double* image = images.data() + v * kNumbersOfImage;
     options.image_width = static_cast<int64_t>(image[0]), options.image_height = static_cast<int64_t>(image[1]);
     options.tanfovx = image[2], options.tanfovy = image[3];
+    options.camera_model = static_cast<int64_t>(image[4]);
+    DSMOE_CHECK_VALUE(image[5] >= 0 && image[5] <= kMostLensNumbers, function, ": images says that a lens has ",
+                      image[5], " numbers; it must have 0 to ", kMostLensNumbers);
+    options.lens.assign(image + 6, image + 6 + static_cast<int>(image[5]));
   }
 
-  static constexpr size_t kTensorsOfCamera = 3, kNumbersOfImage = 4;
+  static constexpr size_t kTensorsOfCamera = 3;
   Inputs inputs;
   Options options;
   Tensors cameras;
@@ -588,12 +467,13 @@ template <class Backend> void project_rows_backward(Arguments& arguments) {
   arguments.give_back_with_list({means2D}, std::move(results));
 }
 
-template <class Backend> Tensor mark_visible(const Tensor& positions, const Tensor& viewmatrix, double near) {
+template <class Backend>
+Tensor mark_visible(const Tensor& positions, const Tensor& viewmatrix, double near, int64_t camera_model) {
   const Expect expect("markVisible", "positions", positions);
   expect("positions", positions, {"N", 3});
   expect("viewmatrix", viewmatrix, {4, 4});
   const typename Backend::Guard guard(positions.device());
-  return Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), near);
+  return Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), near, camera_model);
 }
 
 template <class Backend> void register_ops(Library& m) {
@@ -605,9 +485,6 @@ template <class Backend> void register_ops(Library& m) {
   implement<&blend<Backend>>(m, "blend");
   implement<&blend_backward<Backend>>(m, "blend_backward");
   implement<&radii<Backend>>(m, "radii");
-  implement<&contributions<Backend>>(m, "contributions");
-  implement<&importance<Backend>>(m, "importance");
-  implement<&gate_map<Backend>>(m, "gate_map");
   implement<&count_rows<Backend>>(m, "count_rows");
   implement<&project_rows<Backend>>(m, "project_rows");
   implement<&project_rows_backward<Backend>>(m, "project_rows_backward");

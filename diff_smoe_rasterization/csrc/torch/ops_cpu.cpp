@@ -1,102 +1,35 @@
 // The ops on the CPU.
-#include "cpu/parallel.h"
-#include "dsmoe/training/neighbors.h"
+#include <algorithm>
+
+#include "backend.h"
 #include "ops.h"
-#include "process.h"
-#include "training_ops.h"
+#include "ops/all.h"
 
 namespace dsmoe {
 namespace binding {
 namespace {
 
-struct Cpu {
+struct CpuCore {
+  static constexpr bool kOnHost = true;
+  static int where() { return num_threads(); }
   struct Guard {
     explicit Guard(Device) {}
   };
-
-  template <class S>
-  static cpu::Frame<S> frame_of_gaussians(const Inputs& inputs, const Options& options, const Images& images) {
-    cpu::Frame<S> frame;
-    fill_frame<S>(frame, inputs, options);
-    std::copy_n(data<S>(inputs[kViewMatrix]), 16, frame.camera.view);
-    std::copy_n(data<S>(inputs[kProjMatrix]), 16, frame.camera.projection);
-    std::copy_n(data<S>(inputs[kCampos]), 3, frame.camera.position);
-    frame.config.num_threads = num_threads();
-    frame.images = image_outputs<S>(images);
-    return frame;
-  }
-
-  template <class S>
-  static void forward(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame_of_gaussians<S>(inputs, options, images);
-    StageRecorder recorder(Pass::kForward);
-    cpu::forward(own, memory, recorder.times());
-  }
-
-  template <class S>
-  static void radii(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    cpu::radii(frame_of_gaussians<S>(inputs, options, images), memory);
-  }
+  template <class S> using Frame = cpu::Frame<S>;
+  template <class S> using Gradients = cpu::Gradients<S>;
+  using ViewBatch = cpu::ViewBatch;
 
   static int64_t feature_columns(int64_t num_features) { return num_features; }
-
-  template <class S>
-  static void project(const Inputs& inputs, const Options& options, const Images& images, const Tensor& gates,
-                      const Tensor& features, Allocator&) {
-    auto own = frame_of_gaussians<S>(inputs, options, images);
-    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
-    own.saved.features = mutable_data<S>(features);
-    StageRecorder recorder(Pass::kForward);
-    cpu::project(own, recorder.times());
+  template <class Config> static void set_threads(Config& config) { config.num_threads = num_threads(); }
+  template <class S> static void set_view(Camera<S>& camera, const S* view) { std::copy_n(view, 16, camera.view); }
+  template <class S> static void set_camera(Camera<S>& camera, const S* view, const S* projection, const S* position) {
+    set_view(camera, view);
+    std::copy_n(projection, 16, camera.projection);
+    std::copy_n(position, 3, camera.position);
   }
 
-  // The frame of some footprints, nothing saved yet.
-  template <class S>
-  static cpu::Frame<S> frame_of_footprints(const Footprints& of, const Options& options, const Images& images) {
-    cpu::Frame<S> frame;
-    frame.inputs.num_gaussians = of.gates.size(0);
-    frame.config = footprint_config<S>(of.background, of.background_gate, options);
-    frame.config.num_threads = num_threads();
-    set_image(frame.camera, options);
-    frame.images = image_outputs<S>(images);
-    return frame;
-  }
-
-  template <class S>
-  static void blend(const Footprints& of, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame_of_footprints<S>(of, options, images);
-    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(of.gates.data_ptr<S>());
-    own.saved.features = of.features.data_ptr<S>();
-    StageRecorder recorder(Pass::kForward);
-    cpu::blend_footprints(own, memory, recorder.times());
-  }
-
-  template <class S>
-  static void blend_backward(const Expect& expect, const Footprints& of, const Options& options, const Images& images,
-                             const Saved& saved, const Images& image_gradient_tensors, const Tensor& records,
-                             const Tensor& background) {
-    auto own = frame_of_footprints<S>(of, options, images);
-    own.saved = unpack<S>(expect, saved, cpu::saved_sizes(own));
-    set_sums(own.saved, cpu::saved_sizes(own), own.images.gate_sum);
-    cpu::Gradients<S> gradients;
-    gradients.images = image_gradients<S>(image_gradient_tensors);
-    gradients.inputs.background = mutable_data<S>(background);
-    StageRecorder recorder(Pass::kBackward);
-    cpu::blend_footprints_backward(own, gradients, {mutable_data<S>(records), nullptr}, recorder.times());
-  }
-
-  template <class S>
-  static void project_backward(const Inputs& inputs, const Options& options, const Tensor& features,
-                               const Tensor& radii, const Tensor& records, const Tensor& dL_ddepths,
-                               const Inputs& gradient_tensors) {
-    auto own = frame_of_gaussians<S>(inputs, options, Images());
-    own.saved.features = mutable_data<S>(features);
-    own.images.radii = mutable_data<int32_t>(radii);
-    cpu::Gradients<S> gradients;
-    with_input_gradients<S>(inputs, gradient_tensors, false, gradients, [&] {
-      StageRecorder recorder(Pass::kBackward);
-      cpu::project_backward(own, {mutable_data<S>(records), data<S>(dL_ddepths)}, gradients.inputs, recorder.times());
-    });
+  template <class Frame> static SavedSizes saved_sizes(const Frame& frame, const Options&) {
+    return cpu::saved_sizes(frame);
   }
 
   // Checks what a rendering saved, and points to it.
@@ -109,138 +42,58 @@ struct Cpu {
     return saved;
   }
 
-  template <class S>
-  static void backward(const Expect& expect, const Inputs& inputs, const Options& options, const Images& images,
-                       const Saved& saved, const Images& image_gradient_tensors, const Inputs& gradient_tensors,
-                       bool seen_only) {
-    auto own = frame_of_gaussians<S>(inputs, options, images);
-    own.saved = unpack<S>(expect, saved, cpu::saved_sizes(own));
-    set_sums(own.saved, cpu::saved_sizes(own), own.images.gate_sum);
-    cpu::Gradients<S> gradients;
-    gradients.images = image_gradients<S>(image_gradient_tensors);
-    with_input_gradients<S>(inputs, gradient_tensors, seen_only, gradients, [&] {
-      StageRecorder recorder(Pass::kBackward);
-      cpu::backward(own, gradients, recorder.times());
-    });
+  template <class Frame> static void forward(Frame& frame, const Call& call) {
+    cpu::forward(frame, call.memory, call.times);
+  }
+  template <class Frame, class Gradients>
+  static void backward(const Frame& frame, const Gradients& gradients, const Call& call) {
+    cpu::backward(frame, gradients, call.times);
+  }
+  template <class Frame> static void radii(const Frame& frame, const Call& call) { cpu::radii(frame, call.memory); }
+  template <class Frame> static void project(Frame& frame, const Call& call) { cpu::project(frame, call.times); }
+  template <class Frame, class Footprints, class Gradients>
+  static void project_backward(const Frame& frame, const Footprints& footprints, const Gradients& gradients,
+                               const Call& call) {
+    cpu::project_backward(frame, footprints, gradients, call.times);
+  }
+  template <class Frame> static void blend(Frame& frame, const Call& call) {
+    cpu::blend_footprints(frame, call.memory, call.times);
+  }
+  template <class Frame, class Gradients, class Footprints>
+  static void blend_backward(const Frame& frame, const Gradients& gradients, const Footprints& footprints,
+                             const Call& call) {
+    cpu::blend_footprints_backward(frame, gradients, footprints, call.times);
+  }
+  template <class Frame> static void mark_visible(const Frame& frame, bool* visible) {
+    cpu::mark_visible(frame, visible);
   }
 
-  // The frame of a rendering that is walked again, what it saved not yet in it.
-  template <class S>
-  static cpu::Frame<S> frame_of_rendering(const Tensor& radii, const RasterConfig<S>& config, const Options& options) {
-    cpu::Frame<S> frame;
-    frame.inputs.num_gaussians = radii.numel();
-    frame.config = config;
-    frame.config.num_threads = num_threads();
-    frame.images.radii = mutable_data<int32_t>(radii);
-    set_image(frame.camera, options);
-    return frame;
+  template <class Frame, class Map> static void contributions(const Frame& frame, const Map& map, const Call&) {
+    cpu::contributions(frame, map);
+  }
+  template <class Frame, class Map> static void importance(const Frame& frame, const Map& map, const Call&) {
+    cpu::importance(frame, map);
+  }
+  template <class Frame, class Map> static void gate_map(const Frame& frame, const Map& map, const Call&) {
+    cpu::gate_map(frame, map);
   }
 
-  // The same with what it saved, for passes that read no features.
-  template <class S>
-  static cpu::Frame<S> walked(const Expect& expect, const Tensor& radii, const Saved& saved,
-                              const RasterConfig<S>& config, const Options& options) {
-    auto own = frame_of_rendering<S>(radii, config, options);
-    SavedSizes sizes = cpu::saved_sizes(own);
-    sizes.num_features = -1;
-    own.saved = unpack<S>(expect, saved, sizes);
-    return own;
-  }
-
-  template <class S>
-  static void contributions(const Expect& expect, const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
-                            const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
-    cpu::contributions(walked<S>(expect, radii, saved, config, options), {data<S>(pixel_weights), sums});
-  }
-
-  template <class S>
-  static void gate_map(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
-                       const RasterConfig<S>& config, const Options& options, const GateMap& map) {
-    auto own = walked<S>(expect, radii, saved, config, options);
-    set_sums(own.saved, cpu::saved_sizes(own), mutable_data<S>(gate_sum));
-    cpu::gate_map(own, map);
-  }
-
-  template <class S>
-  static void importance(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
-                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
-    auto own = frame_of_rendering<S>(radii, config, options);
-    own.saved = unpack<S>(expect, saved, cpu::saved_sizes(own));
-    set_sums(own.saved, cpu::saved_sizes(own), mutable_data<S>(gate_sum));
-    cpu::importance(own, map);
-  }
-
-  using ViewBatch = cpu::ViewBatch;
   static void count_rows(const ViewBatch& batch) { cpu::count_rows(batch); }
   static void project_rows(const ViewBatch& batch) { cpu::project_rows(batch); }
   static void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients) {
     cpu::project_rows_backward(batch, gradients);
   }
-
-  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {
-    const Tensor visible = empty({positions.size(0)}, positions, kBool);
-    dispatch(function, positions, [&](auto zero) {
-      using S = decltype(zero);
-      cpu::Frame<S> frame;
-      frame.inputs.num_gaussians = positions.size(0);
-      frame.inputs.means3D = positions.data_ptr<S>();
-      std::copy_n(view.data_ptr<S>(), 16, frame.camera.view);
-      frame.camera.near = static_cast<float>(near);
-      cpu::mark_visible(frame, visible.data_ptr<bool>());
-    });
-    return visible;
-  }
 };
 
-// The trainers' ops.
-constexpr int64_t kChunk = 1 << 14;  // Gaussians a thread takes at a time
-
-struct TrainingCpu {
-  template <class S> static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step) {
-    cpu::adam(tensors, step, num_threads());
-  }
-
-  template <class S> static void catch_up(const LazyAdam<S>& adam) { cpu::catch_up(adam, num_threads()); }
-
-  template <class S> static void note_step(const LazyAdamStep<S>& step) { cpu::note_step(step); }
-
-  template <class S> static void step_gaussians(const GaussianAdam<S>& adam) {
-    cpu::step_gaussians(adam, num_threads());
-  }
-
-  template <class S> static void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows) {
-    cpu::gather_rows(tensors, rows, num_threads());
-  }
-
-  template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
-    return cpu::num_image_loss_sums(loss.planes, loss.height, loss.width);
-  }
-
-  template <class S> static void image_loss(const ImageLoss<S>& loss) { cpu::image_loss(loss, num_threads()); }
-
-  template <class Pass> static void for_each_gaussian(const Pass& pass, int64_t count) {
-    cpu::parallel_for(num_threads(), count, kChunk, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) pass(i);
-    });
-  }
-
-  static Tensor mean_squared_neighbour_distances(const Tensor& points) {
-    check_points(points);
-    const Tensor dense = points.contiguous(), result = empty({points.size(0)}, points);
-    dispatch_real(points, [&](auto zero) {
-      using scalar_t = decltype(zero);
-      cpu::mean_squared_distances(dense.data_ptr<scalar_t>(), points.size(0), result.data_ptr<scalar_t>(),
-                                  num_threads());
-    });
-    return result;
-  }
-};
+using Cpu = Backend<CpuCore>;
 
 }  // namespace
 }  // namespace binding
 }  // namespace dsmoe
 
+DSMOE_LIBRARY_FRAGMENT(m) { dsmoe::binding::all_ops<dsmoe::binding::Cpu>(dsmoe::binding::Definitions{m}); }
+
 DSMOE_LIBRARY_IMPL(CPU, m) {
   dsmoe::binding::register_ops<dsmoe::binding::Cpu>(m);
-  dsmoe::binding::register_training_ops<dsmoe::binding::TrainingCpu>(m);
+  dsmoe::binding::all_ops<dsmoe::binding::Cpu>(dsmoe::binding::Implementations{m});
 }

@@ -1,11 +1,11 @@
 // The ops on CUDA: on the inputs' device, on torch's current stream.
 #include <cuda_runtime_api.h>
 
+#include "backend.h"
 #include "dsmoe/rasterize_cuda.h"
-#include "dsmoe/training/neighbors.h"
 #include "ops.h"
+#include "ops/all.h"
 #include "process.h"
-#include "training_ops.h"
 
 #ifndef DSMOE_STABLE_ABI
 #include <ATen/cuda/CUDAContext.h>
@@ -35,18 +35,20 @@ cudaStream_t current_stream() {
 }
 #endif
 
-struct Cuda {
+struct CudaCore {
+  static constexpr bool kOnHost = false;
+  static cudaStream_t where() { return current_stream(); }
   using Guard = DeviceGuard;
+  template <class S> using Frame = cuda::Frame<S>;
+  template <class S> using Gradients = cuda::Gradients<S>;
+  using ViewBatch = cuda::ViewBatch;
 
-  template <class S>
-  static cuda::Frame<S> frame_of_gaussians(const Inputs& inputs, const Options& options, const Images& images) {
-    cuda::Frame<S> frame;
-    fill_frame<S>(frame, inputs, options);
-    frame.camera.view = data<S>(inputs[kViewMatrix]);
-    frame.camera.projection = data<S>(inputs[kProjMatrix]);
-    frame.camera.position = data<S>(inputs[kCampos]);
-    frame.images = image_outputs<S>(images);
-    return frame;
+  static int64_t feature_columns(int64_t num_features) { return cuda::feature_stride(static_cast<int>(num_features)); }
+  template <class Config> static void set_threads(Config&) {}
+  template <class Camera, class S> static void set_view(Camera& camera, const S* view) { camera.view = view; }
+  template <class Camera, class S>
+  static void set_camera(Camera& camera, const S* view, const S* projection, const S* position) {
+    camera.view = view, camera.projection = projection, camera.position = position;
   }
 
   static cuda::Run run(const Options& options, StageTimes* times) {
@@ -57,82 +59,14 @@ struct Cuda {
     run.times = times;
     return run;
   }
+  static cuda::Run run(const Call& call) { return run(call.options, call.times); }
 
-  template <class S>
-  static void forward(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame_of_gaussians<S>(inputs, options, images);
-    StageRecorder recorder(Pass::kForward);
-    cuda::forward(own, run(options, recorder.times()), memory);
+  static cuda::Work work(const Call& call) {
+    return {current_stream(), &call.memory, nullptr, call.options.deterministic};
   }
 
-  template <class S>
-  static void radii(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    cuda::radii(frame_of_gaussians<S>(inputs, options, images), run(options, nullptr), memory);
-  }
-
-  static int64_t feature_columns(int64_t num_features) { return cuda::feature_stride(static_cast<int>(num_features)); }
-
-  template <class S>
-  static void project(const Inputs& inputs, const Options& options, const Images& images, const Tensor& gates,
-                      const Tensor& features, Allocator& memory) {
-    auto own = frame_of_gaussians<S>(inputs, options, images);
-    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
-    own.saved.features = mutable_data<S>(features);
-    StageRecorder recorder(Pass::kForward);
-    cuda::project_footprints(own, run(options, recorder.times()), memory);
-  }
-
-  // The frame of some footprints, nothing saved yet.
-  template <class S>
-  static cuda::Frame<S> frame_of_footprints(const Footprints& of, const Options& options, const Images& images) {
-    cuda::Frame<S> frame;
-    frame.inputs.num_gaussians = of.gates.size(0);
-    frame.config = footprint_config<S>(of.background, of.background_gate, options);
-    set_image(frame.camera, options);
-    frame.images = image_outputs<S>(images);
-    return frame;
-  }
-
-  template <class S>
-  static void blend(const Footprints& of, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame_of_footprints<S>(of, options, images);
-    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(of.gates.data_ptr<S>());
-    own.saved.features = of.features.data_ptr<S>();
-    StageRecorder recorder(Pass::kForward);
-    cuda::blend_footprints(own, run(options, recorder.times()), memory);
-  }
-
-  template <class S>
-  static void blend_backward(const Expect& expect, const Footprints& of, const Options& options, const Images& images,
-                             const Saved& saved, const Images& image_gradient_tensors, const Tensor& records,
-                             const Tensor& background) {
-    auto own = frame_of_footprints<S>(of, options, images);
-    StageRecorder recorder(Pass::kBackward);
-    const cuda::Run how = run(options, recorder.times());
-    own.saved = unpack<S>(expect, saved, cuda::saved_sizes(own, how));
-    set_sums(own.saved, cuda::saved_sizes(own, how), own.images.gate_sum);
-    cuda::Gradients<S> gradients;
-    gradients.images = image_gradients<S>(image_gradient_tensors);
-    gradients.inputs.background = mutable_data<S>(background);
-    TensorMemory memory(of.gates);
-    cuda::blend_footprints_backward(own, gradients, {mutable_data<S>(records), nullptr}, how, memory);
-  }
-
-  template <class S>
-  static void project_backward(const Inputs& inputs, const Options& options, const Tensor& features,
-                               const Tensor& radii, const Tensor& records, const Tensor& dL_ddepths,
-                               const Inputs& gradient_tensors) {
-    auto own = frame_of_gaussians<S>(inputs, options, Images());
-    own.saved.features = mutable_data<S>(features);
-    own.images.radii = mutable_data<int32_t>(radii);
-    StageRecorder recorder(Pass::kBackward);
-    const cuda::Run how = run(options, recorder.times());
-    cuda::Gradients<S> gradients;
-    TensorMemory memory(features);
-    with_input_gradients<S>(inputs, gradient_tensors, false, gradients, [&] {
-      cuda::project_footprints_backward(own, {mutable_data<S>(records), data<S>(dL_ddepths)}, gradients.inputs, how,
-                                        memory);
-    });
+  template <class Frame> static cuda::SavedSizes saved_sizes(const Frame& frame, const Options& options) {
+    return cuda::saved_sizes(frame, run(options, nullptr));
   }
 
   // Checks what a rendering saved, and points to it. The capacity, and whether there are segments, is what it has.
@@ -146,153 +80,54 @@ struct Cuda {
     return saved;
   }
 
-  template <class S>
-  static void backward(const Expect& expect, const Inputs& inputs, const Options& options, const Images& images,
-                       const Saved& saved, const Images& image_gradient_tensors, const Inputs& gradient_tensors,
-                       bool seen_only) {
-    auto own = frame_of_gaussians<S>(inputs, options, images);
-    StageRecorder recorder(Pass::kBackward);
-    const cuda::Run how = run(options, recorder.times());
-    own.saved = unpack<S>(expect, saved, cuda::saved_sizes(own, how));
-    set_sums(own.saved, cuda::saved_sizes(own, how), own.images.gate_sum);
-    cuda::Gradients<S> gradients;
-    gradients.images = image_gradients<S>(image_gradient_tensors);
-    TensorMemory memory(inputs[kMeans3D]);
-    with_input_gradients<S>(inputs, gradient_tensors, seen_only, gradients,
-                            [&] { cuda::backward(own, gradients, how, memory); });
+  template <class Frame> static void forward(Frame& frame, const Call& call) {
+    cuda::forward(frame, run(call), call.memory);
+  }
+  template <class Frame, class Gradients>
+  static void backward(const Frame& frame, const Gradients& gradients, const Call& call) {
+    cuda::backward(frame, gradients, run(call), call.memory);
+  }
+  template <class Frame> static void radii(const Frame& frame, const Call& call) {
+    cuda::radii(frame, run(call), call.memory);
+  }
+  template <class Frame> static void project(const Frame& frame, const Call& call) {
+    cuda::project_footprints(frame, run(call), call.memory);
+  }
+  template <class Frame, class Footprints, class Gradients>
+  static void project_backward(const Frame& frame, const Footprints& footprints, const Gradients& gradients,
+                               const Call& call) {
+    cuda::project_footprints_backward(frame, footprints, gradients, run(call), call.memory);
+  }
+  template <class Frame> static void blend(Frame& frame, const Call& call) {
+    cuda::blend_footprints(frame, run(call), call.memory);
+  }
+  template <class Frame, class Gradients, class Footprints>
+  static void blend_backward(const Frame& frame, const Gradients& gradients, const Footprints& footprints,
+                             const Call& call) {
+    cuda::blend_footprints_backward(frame, gradients, footprints, run(call), call.memory);
+  }
+  template <class Frame> static void mark_visible(const Frame& frame, bool* visible) {
+    cuda::mark_visible(frame, visible, {current_stream()});
   }
 
-  // The frame of a rendering that is walked again, what it saved not yet in it.
-  template <class S>
-  static cuda::Frame<S> frame_of_rendering(const Tensor& radii, const RasterConfig<S>& config, const Options& options) {
-    cuda::Frame<S> frame;
-    frame.inputs.num_gaussians = radii.numel();
-    frame.config = config;
-    frame.images.radii = mutable_data<int32_t>(radii);
-    set_image(frame.camera, options);
-    return frame;
+  template <class Frame, class Map> static void contributions(const Frame& frame, const Map& map, const Call& call) {
+    cuda::contributions(frame, map, work(call));
+  }
+  template <class Frame, class Map> static void importance(const Frame& frame, const Map& map, const Call& call) {
+    cuda::importance(frame, map, work(call));
+  }
+  template <class Frame, class Map> static void gate_map(const Frame& frame, const Map& map, const Call& call) {
+    cuda::gate_map(frame, map, work(call));
   }
 
-  // The same with what it saved, for passes that read no features.
-  template <class S>
-  static cuda::Frame<S> walked(const Expect& expect, const Tensor& radii, const Saved& saved,
-                               const RasterConfig<S>& config, const Options& options) {
-    auto own = frame_of_rendering<S>(radii, config, options);
-    auto sizes = cuda::saved_sizes(own, run(options, nullptr));
-    sizes.num_features = -1;
-    own.saved = unpack<S>(expect, saved, sizes);
-    return own;
-  }
-
-  template <class S>
-  static void contributions(const Expect& expect, const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
-                            const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
-    TensorMemory memory(pixel_weights);
-    cuda::contributions(walked<S>(expect, radii, saved, config, options), {data<S>(pixel_weights), sums},
-                        {current_stream(), &memory, nullptr, options.deterministic});
-  }
-
-  template <class S>
-  static void gate_map(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
-                       const RasterConfig<S>& config, const Options& options, const GateMap& map) {
-    auto own = walked<S>(expect, radii, saved, config, options);
-    set_sums(own.saved, cuda::saved_sizes(own, run(options, nullptr)), mutable_data<S>(gate_sum));
-    TensorMemory memory(radii);
-    cuda::gate_map(own, map, {current_stream(), &memory});
-  }
-
-  template <class S>
-  static void importance(const Expect& expect, const Tensor& gate_sum, const Tensor& radii, const Saved& saved,
-                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
-    auto own = frame_of_rendering<S>(radii, config, options);
-    const cuda::Run how = run(options, nullptr);
-    own.saved = unpack<S>(expect, saved, cuda::saved_sizes(own, how));
-    set_sums(own.saved, cuda::saved_sizes(own, how), mutable_data<S>(gate_sum));
-    TensorMemory memory(gate_sum);
-    cuda::importance(own, map, {how.stream, &memory, nullptr, how.deterministic});
-  }
-
-  using ViewBatch = cuda::ViewBatch;
   static void count_rows(const ViewBatch& batch) { cuda::count_rows(batch, {current_stream()}); }
   static void project_rows(const ViewBatch& batch) { cuda::project_rows(batch, {current_stream()}); }
   static void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients) {
     cuda::project_rows_backward(batch, gradients, {current_stream()});
   }
-
-  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {
-    const Tensor visible = empty({positions.size(0)}, positions, kBool);
-    dispatch(function, positions, [&](auto zero) {
-      using S = decltype(zero);
-      cuda::Frame<S> frame;
-      frame.inputs.num_gaussians = positions.size(0);
-      frame.inputs.means3D = positions.data_ptr<S>();
-      frame.camera.view = view.data_ptr<S>();
-      frame.camera.near = static_cast<float>(near);
-      cuda::mark_visible(frame, visible.data_ptr<bool>(), {current_stream()});
-    });
-    return visible;
-  }
 };
 
-// The trainers' ops.
-struct TrainingCuda {
-  template <class S> static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step) {
-    cuda::adam(tensors, step, current_stream());
-  }
-
-  template <class S> static void catch_up(const LazyAdam<S>& adam) { cuda::catch_up(adam, current_stream()); }
-
-  template <class S> static void note_step(const LazyAdamStep<S>& step) { cuda::note_step(step, current_stream()); }
-
-  template <class S> static void step_gaussians(const GaussianAdam<S>& adam) {
-    cuda::step_gaussians(adam, current_stream());
-  }
-
-  template <class S> static void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows) {
-    cuda::gather_rows(tensors, rows, current_stream());
-  }
-
-  template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
-    return cuda::num_image_loss_sums<S>(loss.planes, loss.height, loss.width);
-  }
-
-  template <class S> static void image_loss(const ImageLoss<S>& loss) { cuda::image_loss(loss, current_stream()); }
-
-  template <class Pass> static void for_each_gaussian(const Pass& pass, int64_t count) {
-    cuda::for_each_gaussian(pass, count, current_stream());
-  }
-
-  static Tensor mean_squared_neighbour_distances(const Tensor& points) {
-    check_points(points);
-    const DeviceGuard guard(points.device());
-    const int64_t count = points.size(0);
-    const Tensor result = empty({count}, points);
-    if (count == 0) return result;
-    const Tensor given = points.contiguous(), low = smallest(given), high = largest(given);
-    const Tensor codes = empty({count}, given, kLong);
-    dispatch_real(given, [&](auto zero) {
-      using scalar_t = decltype(zero);
-      cuda::MortonCodes<scalar_t> morton = {};
-      morton.points = given.data_ptr<scalar_t>();
-      morton.count = count;
-      morton.low = low.data_ptr<scalar_t>();
-      morton.high = high.data_ptr<scalar_t>();
-      morton.codes = codes.data_ptr<int64_t>();
-      cuda::morton_codes(morton, current_stream());
-      const Tensor order = argsort(codes);
-      const Tensor sorted = index_select(given, 0, order);
-      const Tensor boxes = empty({(count + cuda::kBoxPoints - 1) / cuda::kBoxPoints, 2, 3}, given);
-      cuda::NeighborDistances<scalar_t> search = {};
-      search.points = sorted.data_ptr<scalar_t>();
-      search.count = count;
-      search.order = order.data_ptr<int64_t>();
-      search.boxes = boxes.data_ptr<scalar_t>();
-      search.result = result.data_ptr<scalar_t>();
-      cuda::mean_squared_distances(search, current_stream());
-    });
-    return result;
-  }
-};
+using Cuda = Backend<CudaCore>;
 
 }  // namespace
 }  // namespace binding
@@ -300,5 +135,5 @@ struct TrainingCuda {
 
 DSMOE_LIBRARY_IMPL(CUDA, m) {
   dsmoe::binding::register_ops<dsmoe::binding::Cuda>(m);
-  dsmoe::binding::register_training_ops<dsmoe::binding::TrainingCuda>(m);
+  dsmoe::binding::all_ops<dsmoe::binding::Cuda>(dsmoe::binding::Implementations{m});
 }

@@ -28,10 +28,13 @@ struct Given : GaussianRasterizationSettings {
   int64_t blend_mode = 0;
   double fixed_background_gate = 0, faint_below = 0;
   at::Tensor background_gate;
+  int64_t camera_model = 0;
+  std::vector<double> lens;
   bool depth = false, inverse_depth = false, for_backward = false;
 
  private:
   void resolve_blend();
+  void resolve_lens();
 };
 
 // For messages alone.
@@ -49,6 +52,7 @@ std::string mode_names() {
 
 Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Settings(settings) {
   resolve_blend();
+  resolve_lens();
   for (const std::string& name : arguments.outputs) {
     bool known = name == "alpha";
     binding::for_each_feature_image([&](binding::Image image, auto field) {
@@ -84,6 +88,27 @@ void Given::resolve_blend() {
   if (is_one && Settings::blend_mode == Blend<BlendMode::kSmoeEq7>::kName) {
     blend_mode = static_cast<int64_t>(BlendMode::kAlpha);
   }
+}
+
+void Given::resolve_lens() {
+  const std::string& name = Settings::camera_model;
+  std::string names;
+  camera_model = -1;
+  for (int model = 0; model < kNumLensModels; ++model) {
+    if (name == kLensNames[model]) camera_model = model;
+    names += (model == 0 ? "" : ", ") + std::string(kLensNames[model]);
+  }
+  TORCH_CHECK_VALUE(camera_model >= 0, "rasterize: camera_model is '", name, "'; it must be one of ", names);
+  if (camera_model == 0) {
+    TORCH_CHECK_VALUE(distortion.empty() && !principal_point,
+                      "rasterize: ", distortion.empty() ? "principal_point" : "distortion",
+                      " is given, but camera_model is 'pinhole'; it must be absent");
+    return;
+  }
+  const std::array<double, 2> centre = {static_cast<double>(image_width) / 2, static_cast<double>(image_height) / 2};
+  const auto principal = principal_point.value_or(centre);
+  lens.assign(principal.begin(), principal.end());
+  lens.insert(lens.end(), distortion.begin(), distortion.end());
 }
 
 // The op's tensors in their order; absent ones are undefined.
@@ -140,7 +165,7 @@ variable_list call_rasterize(const Call& call) {
 }
 
 struct Rasterize : torch::autograd::Function<Rasterize> {
-  // tensors: those of the call, if autograd sees them.
+  // tensors: the call's, if autograd sees them.
   static variable_list forward(AutogradContext* context, at::TensorList tensors, const Call& call) {
     variable_list results = call_rasterize(call), kept = tensors.vec();
     kept.insert(kept.end(), results.begin(), results.end());

@@ -31,6 +31,7 @@
 #define DSMOE_CHECK_NOT_IMPLEMENTED TORCH_CHECK_NOT_IMPLEMENTED
 
 #define DSMOE_LIBRARY(m) TORCH_LIBRARY(diff_smoe_rasterization, m)
+#define DSMOE_LIBRARY_FRAGMENT(m) TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m)
 #define DSMOE_LIBRARY_IMPL(key, m) TORCH_LIBRARY_IMPL(diff_smoe_rasterization, key, m)
 
 namespace dsmoe {

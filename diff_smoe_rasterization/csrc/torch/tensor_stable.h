@@ -1,4 +1,4 @@
-// The names of tensor.h by LibTorch's stable ABI, that of 2.11: torch::stable::Tensor and its functions, which are
+// The names of tensor.h by LibTorch's stable ABI of 2.11: torch::stable::Tensor and its functions, which are
 // headers over C functions. By hand is what they lack (DEVELOPING.md, "Wheels"), and what a call would lose by them: an
 // op of theirs goes through the dispatcher. No other C++ class of LibTorch is named here.
 #pragma once
@@ -26,6 +26,7 @@
 #define DSMOE_CHECK_NOT_IMPLEMENTED(...) DSMOE_RAISE_UNLESS(ErrorKind::kNotImplemented, __VA_ARGS__)
 
 #define DSMOE_LIBRARY(m) STABLE_TORCH_LIBRARY(diff_smoe_rasterization, m)
+#define DSMOE_LIBRARY_FRAGMENT(m) STABLE_TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m)
 #define DSMOE_LIBRARY_IMPL(key, m) STABLE_TORCH_LIBRARY_IMPL(diff_smoe_rasterization, key, m)
 
 namespace dsmoe {

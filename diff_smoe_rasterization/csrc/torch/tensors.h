@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <array>
 #include <limits>
+#include <stdexcept>
+#include <string>
 #include <utility>
 #include <vector>
 
@@ -238,11 +240,32 @@ template <class S> GaussianGradients<S> gaussian_gradients(const Inputs& gradien
   return out;
 }
 
+// Numbers of a view in the ops on batches, whose last ones are those of its lens.
+constexpr int kMostLensNumbers = 2 + kMostDistortion, kNumbersOfImage = 6 + kMostLensNumbers;
+
+// The lens of the options, whose focal lengths are in the tangents, as those of a pinhole are.
+template <class S> Lens<S> lens_of(const Options& options) {
+  LensCalibration of;
+  of.model = static_cast<LensModel>(to_int(options.camera_model));
+  if (of.model == LensModel::kPinhole && options.lens.empty()) return {};
+  constexpr size_t kPrincipal = 2;
+  if (options.lens.size() < kPrincipal) {
+    throw std::invalid_argument("lens_of: lens has length " + std::to_string(options.lens.size()) +
+                                "; it must hold the principal point and the distortion");
+  }
+  of.width = static_cast<int>(options.image_width), of.height = static_cast<int>(options.image_height);
+  of.fx = of.width / (2 * options.tanfovx), of.fy = of.height / (2 * options.tanfovy);
+  of.cx = options.lens[0], of.cy = options.lens[1];
+  of.distortion.assign(options.lens.begin() + kPrincipal, options.lens.end());
+  return dsmoe::lens_of(of).as<S>();
+}
+
 // Everything of a rendering but its camera's tensors and what it saved.
 template <class S, class Frame> void fill_frame(Frame& frame, const Inputs& inputs, const Options& options) {
   frame.inputs = gaussian_inputs<S>(inputs, options);
   frame.config = raster_config<S>(inputs, options);
   set_image(frame.camera, options);
+  frame.camera.lens = lens_of<S>(options);
 }
 
 // A gradient that the core returns in one piece, and the inputs whose gradients are its parts, in their order.

@@ -84,9 +84,9 @@ template <class S> DSMOE_HD bool is_finite(const Colors<S>& colors, int num_chan
 // What the colour of one Gaussian on an image depends on.
 template <class S> struct ColorSource {
   Colors<S> colors;
-  Vec3<S> mean;                   // of the Gaussian, world
-  const Camera<S>& camera;        // that sees it
-  const RasterConfig<S>& config;  // which features there are
+  Vec3<S> mean;                    // of the Gaussian, world
+  const PinholeCamera<S>& camera;  // that sees it; its lens has no part in a colour
+  const RasterConfig<S>& config;   // which features there are
 
   DSMOE_HD ShRules<S> sh_rules() const { return {colors.sh_degree, config.clamp_color, load3(camera.position)}; }
 };
@@ -144,7 +144,7 @@ DSMOE_HD ProjectedGradient<S> projected_gradient(const GateGradient<S>& gate, co
   return out;
 }
 
-// Writes the gradients of Gaussian i, except those of its colours.
+// Writes the gradients of Gaussian i, except by its colours.
 template <class S>
 DSMOE_HD void store_gradient(const GaussianGradient<S>& g, const GaussianGradients<S>& out, int64_t i) {
   if (out.means3D != nullptr) store3(out.means3D + 3 * i, g.mean);
@@ -183,10 +183,10 @@ template <class S> DSMOE_HD void store_zeros(const GaussianGradients<S>& out, in
   store_zeros(color_gradients_of(out, num_channels, num_sh, i), num_channels, num_sh);
 }
 
-// One Gaussian of a rendering.
-template <class S> struct RenderedGaussian {
+// One Gaussian of a rendering. Without a lens, AnyCamera is PinholeCamera<S> where code for lenses would cost time.
+template <class S, class AnyCamera = Camera<S>> struct RenderedGaussian {
   const GaussianInputs<S>& inputs;
-  const Camera<S>& camera;
+  const AnyCamera& camera;
   const RasterConfig<S>& config;
   int64_t index;  // of the Gaussian
 
@@ -197,7 +197,8 @@ template <class S> struct RenderedGaussian {
 
 // Projects a Gaussian, and writes its features, [F]. The radius is 0 if the Gaussian is culled. Then the rest means
 // nothing.
-template <class S> DSMOE_HD Projection<S> project_gaussian(const RenderedGaussian<S>& of, S* features) {
+template <class S, class AnyCamera = Camera<S>>
+DSMOE_HD Projection<S> project_gaussian(const RenderedGaussian<S, AnyCamera>& of, S* features) {
   const Gaussian<S> gaussian = load_gaussian(of.inputs, of.index);
   Projection<S> out = project(gaussian, of.camera, of.config.projection_rules());
   if (out.radius > 0 && !write_features(of.color_source(gaussian.mean), out.gaussian.depth, features)) out.radius = 0;
@@ -231,13 +232,14 @@ template <int kShs> struct ViewSum {
 
   // Adds those that a view gives. features: of the Gaussian's row; record: as FootprintGradients has them. Returns the
   // view's own gradient, mean2D among them.
+  template <class AnyCamera>
   DSMOE_HD GaussianGradient<float> add(const Gaussian<float>& from, const ColorSource<float>& source,
-                                       const float* features, const float* record) {
+                                       const AnyCamera& camera, const float* features, const float* record) {
     float by_dc[3] = {}, by_shs[kShs] = {};
     const PixelSums<float> sums = pixel_sums(record, features);
     const Vec3<float> color = write_color_gradients(source, sums.features, {nullptr, by_dc, by_shs});
     const GaussianGradient<float> view =
-        project_backward(from, source.camera, source.config.projection_rules(),
+        project_backward(from, camera, source.config.projection_rules(),
                          projected_gradient(sums.gate, sums.features.dL_dvalues, color, source.config));
     gaussian.mean = gaussian.mean + view.mean;
     gaussian.opacity += view.opacity;
@@ -254,8 +256,8 @@ template <int kShs> struct ViewSum {
 
 // Writes the gradients of a Gaussian, but for coefficients above the active degree. Returns the Gaussian's share of the
 // camera's gradient.
-template <class S>
-DSMOE_HD CameraShare<S> project_gaussian_backward(const RenderedGaussian<S>& of, const PixelSums<S>& sums,
+template <class S, class AnyCamera = Camera<S>>
+DSMOE_HD CameraShare<S> project_gaussian_backward(const RenderedGaussian<S, AnyCamera>& of, const PixelSums<S>& sums,
                                                   const GaussianGradients<S>& out) {
   const RasterConfig<S>& config = of.config;
   const Gaussian<S> gaussian = load_gaussian(of.inputs, of.index);

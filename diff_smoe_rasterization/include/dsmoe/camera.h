@@ -4,13 +4,14 @@
 #include <array>
 
 #include "dsmoe/constants.h"
+#include "dsmoe/lens.h"
 #include "dsmoe/vec.h"
 
 namespace dsmoe {
 
 // Matrices are transposed, as the trainers pass them: a point is a row vector, to the left of the matrix. They are
 // stored row by row. view: world to view. projection: world to clip, with the principal point.
-template <class S> struct Camera {
+template <class S> struct PinholeCamera {
   int width = 0, height = 0;       // pixels
   S tan_fov_x = 0, tan_fov_y = 0;  // tan of half the field of view
   S view[16] = {};                 // [4, 4]
@@ -18,6 +19,9 @@ template <class S> struct Camera {
   S position[3] = {};              // world
   S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
+
+// With a lens that is no pinhole, neither the tangents nor `projection` are read: all of the pose is in `view`.
+template <class S> struct Camera : PinholeCamera<S> { Lens<S> lens; };
 
 // A calibrated pinhole camera. View axes are x right, y down, z forward. The centre of the top left pixel is
 // (0.5, 0.5), as in COLMAP.
@@ -122,7 +126,7 @@ template <class S> DSMOE_HD S inverse_clip_w(const S* m, Vec3<S> p) {
 }
 
 // World to pixel coordinates. Pixel centres are integers. NDC -1 and 1 are the outer edges of the border pixels.
-template <class S> DSMOE_HD Vec2<S> project_to_pixel(const Camera<S>& camera, Vec3<S> p) {
+template <class S> DSMOE_HD Vec2<S> project_to_pixel(const PinholeCamera<S>& camera, Vec3<S> p) {
   const S* m = camera.projection;
   const Vec3<S> clip = transform_point(m, p);
   const S inverse_w = inverse_clip_w(m, p);
@@ -136,7 +140,7 @@ template <class S> struct PixelGradient {
 };
 
 template <class S>
-DSMOE_HD PixelGradient<S> project_to_pixel_backward(const Camera<S>& camera, Vec3<S> p, Vec2<S> dL_dpixel) {
+DSMOE_HD PixelGradient<S> project_to_pixel_backward(const PinholeCamera<S>& camera, Vec3<S> p, Vec2<S> dL_dpixel) {
   const S* m = camera.projection;
   const Vec3<S> clip = transform_point(m, p);
   const S inverse_w = inverse_clip_w(m, p);

@@ -35,7 +35,7 @@ template <class S> struct ProjectionJacobian {
   Mat23<S> jacobian;  // J
 };
 
-template <class S> DSMOE_HD ProjectionJacobian<S> projection_jacobian(const Camera<S>& camera, Vec3<S> view) {
+template <class S> DSMOE_HD ProjectionJacobian<S> projection_jacobian(const PinholeCamera<S>& camera, Vec3<S> view) {
   ProjectionJacobian<S> out;
   out.focal = {S(camera.width) / (S(2) * camera.tan_fov_x), S(camera.height) / (S(2) * camera.tan_fov_y)};
   const S limit_x = S(kFrustumMargin) * camera.tan_fov_x, limit_y = S(kFrustumMargin) * camera.tan_fov_y;

@@ -9,9 +9,9 @@ namespace dsmoe {
 
 // Which pairs count.
 enum class Cut {
-  kAlpha,   // 3DGS: those of alpha >= 1/255
-  kStrong,  // the paper's authors: those of alpha >= 1/2040, or of the caller's least alpha. Weaker ones are tails
-  kKernel,  // the paper's text: those of G >= 1e-5, and of the least alpha below
+  kAlpha,   // 3DGS: alpha >= 1/255
+  kStrong,  // the paper's authors: alpha >= 1/2040, or the caller's least alpha. Weaker pairs are tails
+  kKernel,  // the paper's text: G >= 1e-5, and the least alpha below
 };
 
 // The factors of d.x^2, d.x d.y and d.y^2 in the exponent -1/2 d^T Sigma2D^-1 d, where d = pixel - mean.

@@ -56,6 +56,8 @@ DSMOE_HD float log(float x) { return ::logf(x); }
 DSMOE_HD double log(double x) { return ::log(x); }
 DSMOE_HD float sqrt(float x) { return ::sqrtf(x); }
 DSMOE_HD double sqrt(double x) { return ::sqrt(x); }
+DSMOE_HD float atan2(float y, float x) { return ::atan2f(y, x); }
+DSMOE_HD double atan2(double y, double x) { return ::atan2(y, x); }
 DSMOE_HD float ceil(float x) { return ::ceilf(x); }
 DSMOE_HD double ceil(double x) { return ::ceil(x); }
 DSMOE_HD float floor(float x) { return ::floorf(x); }

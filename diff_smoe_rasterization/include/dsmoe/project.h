@@ -36,7 +36,7 @@ template <class S> struct alignas(16) ProjectedGaussian {
   Sym2<S> conic;    // per px^2
   S opacity;        // after antialiasing
   S squared_reach;  // k^2 of the footprint
-  S depth;          // view z
+  S depth;          // view z; of a lens that sees around, the distance from the camera
 };
 constexpr int kProjectedGaussianSize = 8;
 
@@ -67,23 +67,87 @@ template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, TileGrid grid, 
   return {0, 0, grid.columns, grid.rows};
 }
 
+// What comes back from a Gaussian's pixels.
+template <class S> struct ProjectedGradient {
+  GateGradient<S> gate;
+  S depth, inverse_depth;  // by the depth and its inverse; 0 if nothing asks for them
+  Vec3<S> color;           // by the mean, on the way of the colour
+};
+
+// What comes back to a point in view space, and to the camera's projection.
+template <class S> struct ViewGradient {
+  Vec3<S> view;
+  PixelGradient<S> pixel;
+};
+
+// The two ways from view space to the image. By the camera's matrix:
+template <class S> struct ByMatrix {
+  using Point = ProjectionJacobian<S>;
+  const PinholeCamera<S>& camera;
+
+  DSMOE_HD S depth(Vec3<S> view) const { return view.z; }
+  DSMOE_HD Point point(Vec3<S> view) const { return projection_jacobian(camera, view); }
+  DSMOE_HD bool sees(const Point&) const { return true; }
+  DSMOE_HD Vec2<S> pixel(Vec3<S> mean, const Point&) const { return project_to_pixel(camera, mean); }
+
+  DSMOE_HD ViewGradient<S> backward(Vec3<S> mean, Vec3<S> view, const Point& point, const Mat23<S>& dL_dJ,
+                                    const ProjectedGradient<S>& g, bool inverse_depth) const {
+    ViewGradient<S> out;
+    out.view = projection_jacobian_backward(point, dL_dJ);
+    out.view.z += g.depth;
+    if (inverse_depth) out.view.z -= g.inverse_depth / (view.z * view.z);
+    out.pixel = project_to_pixel_backward(camera, mean, g.gate.mean);
+    return out;
+  }
+
+  // J^T dL_daxes
+  DSMOE_HD Mat3<S> rotation_backward(const Mat23<S>& j, const Mat23<S>& dL_daxes) const {
+    return {j.r0.x * dL_daxes.r0, j.r1.y * dL_daxes.r1, j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1};
+  }
+};
+
+// Through its lens, which is no pinhole. All of the pose comes from the view matrix.
+template <class S> struct ByLens {
+  using Point = LensPoint<S>;
+  const Camera<S>& camera;
+
+  DSMOE_HD S depth(Vec3<S> view) const { return view_depth(camera.lens.model, view); }
+  DSMOE_HD Point point(Vec3<S> view) const { return through_lens(camera.lens, view); }
+  DSMOE_HD bool sees(const Point& point) const { return point.seen; }
+  DSMOE_HD Vec2<S> pixel(Vec3<S>, const Point& point) const { return point.pixel; }
+
+  DSMOE_HD ViewGradient<S> backward(Vec3<S>, Vec3<S> view, const Point&, const Mat23<S>& dL_dJ,
+                                    const ProjectedGradient<S>& g, bool inverse_depth) const {
+    S dL_ddepth = g.depth;
+    if (inverse_depth) dL_ddepth -= g.inverse_depth / (depth(view) * depth(view));
+    return {through_lens_backward(camera.lens, view, g.gate.mean, dL_dJ) +
+                view_depth_backward(camera.lens.model, view, dL_ddepth),
+            {}};
+  }
+
+  DSMOE_HD Mat3<S> rotation_backward(const Mat23<S>& j, const Mat23<S>& dL_daxes) const {
+    return {j.r0.x * dL_daxes.r0 + j.r1.x * dL_daxes.r1, j.r0.y * dL_daxes.r0 + j.r1.y * dL_daxes.r1,
+            j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1};
+  }
+};
+
 // A Gaussian's covariance on the image plane, and what the backward pass needs of its making.
-template <class S> struct Covariances {
+template <class S, class Point> struct Covariances {
   Vec3<S> scale;     // modified; if the covariance is not given
   Mat3<S> rotation;  // if the covariance is not given
-  ProjectionJacobian<S> jacobian;
+  Point point;
   Mat23<S> axes;
   ImageFactor<S> factor;  // if the covariance is not given
   Sym2<S> image;          // px^2, before the low-pass filter
   Conic<S> conic;
 };
 
-template <class S>
-DSMOE_HD Covariances<S> covariances(const Gaussian<S>& gaussian, const Camera<S>& camera, Vec3<S> view,
-                                    const ProjectionRules<S>& rules) {
-  Covariances<S> out = {};
-  out.jacobian = projection_jacobian(camera, view);
-  out.axes = image_axes(out.jacobian.jacobian, view_rotation(camera.view));
+template <class S, class Way>
+DSMOE_HD Covariances<S, typename Way::Point> covariances(const Gaussian<S>& gaussian, const Way& way, Vec3<S> view,
+                                                         const ProjectionRules<S>& rules) {
+  Covariances<S, typename Way::Point> out = {};
+  out.point = way.point(view);
+  out.axes = image_axes(out.point.jacobian, view_rotation(way.camera.view));
   if (gaussian.has_covariance) {
     out.image = covariance_2d(out.axes, gaussian.covariance);
     out.conic = make_conic(out.image, rules.low_pass);
@@ -97,15 +161,18 @@ DSMOE_HD Covariances<S> covariances(const Gaussian<S>& gaussian, const Camera<S>
   return out;
 }
 
-template <class S>
-DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& camera, const ProjectionRules<S>& rules) {
+template <class S, class Way>
+DSMOE_HD Projection<S> project_by(const Way& way, const Gaussian<S>& gaussian, const ProjectionRules<S>& rules) {
+  const PinholeCamera<S>& camera = way.camera;
   Projection<S> out;
   out.radius = 0;
   const Vec3<S> view = transform_point(camera.view, gaussian.mean);
-  if (!(view.z > camera.near) || !in_range(gaussian.opacity)) return out;
-  const auto made = covariances(gaussian, camera, view, rules);
+  const S depth = way.depth(view);
+  if (!(depth > camera.near) || !in_range(gaussian.opacity)) return out;
+  const auto made = covariances(gaussian, way, view, rules);
+  if (!way.sees(made.point)) return out;
   const Conic<S>& conic = made.conic;
-  const Vec2<S> pixel = project_to_pixel(camera, gaussian.mean);
+  const Vec2<S> pixel = way.pixel(gaussian.mean, made.point);
   const S radius = screen_radius(conic);
   // NaN and infinity in any other attribute reach the determinant or the pixel.
   if (!is_ellipse(conic) || !is_finite(radius)) return out;
@@ -119,17 +186,22 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
   S opacity = gaussian.opacity;
   if (rules.antialiasing) opacity *= opacity_compensation(conic);
   const S reach = squared_reach(cut, opacity, rules.cut.of(opacity));
-  out.gaussian = {pixel, conic.inverse, opacity, reach, view.z};
+  out.gaussian = {pixel, conic.inverse, opacity, reach, depth};
   out.radius = static_cast<int32_t>(min(radius, S(1 << 30)));
   return out;
 }
 
-// What comes back from a Gaussian's pixels.
-template <class S> struct ProjectedGradient {
-  GateGradient<S> gate;
-  S depth, inverse_depth;  // by z and 1 / z; 0 if nothing asks for them
-  Vec3<S> color;           // by the mean, on the way of the colour
-};
+template <class S>
+DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const PinholeCamera<S>& camera,
+                               const ProjectionRules<S>& rules) {
+  return project_by(ByMatrix<S>{camera}, gaussian, rules);
+}
+
+template <class S>
+DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& camera, const ProjectionRules<S>& rules) {
+  if (camera.lens.model == LensModel::kPinhole) return project_by(ByMatrix<S>{camera}, gaussian, rules);
+  return project_by(ByLens<S>{camera}, gaussian, rules);
+}
 
 template <class S> struct GaussianGradient {
   Vec3<S> mean;
@@ -141,12 +213,13 @@ template <class S> struct GaussianGradient {
   CameraShare<S> camera;
 };
 
-template <class S>
-DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const Camera<S>& camera,
-                                              const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
+template <class S, class Way>
+DSMOE_HD GaussianGradient<S> project_backward_by(const Way& way, const Gaussian<S>& gaussian,
+                                                 const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
+  const PinholeCamera<S>& camera = way.camera;
   GaussianGradient<S> out = {};
   const Vec3<S> view = transform_point(camera.view, gaussian.mean);
-  const auto made = covariances(gaussian, camera, view, rules);
+  const auto made = covariances(gaussian, way, view, rules);
   const Conic<S>& conic = made.conic;
 
   ImageGradient<S> by_image = {conic.inverse, g.gate.conic, {S(0), S(0), S(0)}};
@@ -172,18 +245,25 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
 
   const Mat3<S> view_axes = view_rotation(camera.view);
   const Mat23<S> dL_dJ = {view_axes * dL_daxes.r0, view_axes * dL_daxes.r1};
-  Vec3<S> dL_dview = projection_jacobian_backward(made.jacobian, dL_dJ);
-  dL_dview.z += g.depth;
-  if (rules.inverse_depth) dL_dview.z -= g.inverse_depth / (view.z * view.z);
-  const auto by_pixel = project_to_pixel_backward(camera, gaussian.mean, g.gate.mean);
-  out.mean = transform_point_backward(camera.view, dL_dview) + by_pixel.point + g.color;
+  const auto by = way.backward(gaussian.mean, view, made.point, dL_dJ, g, rules.inverse_depth);
+  out.mean = transform_point_backward(camera.view, by.view) + by.pixel.point + g.color;
   out.mean2D = {g.gate.mean.x * S(0.5) * S(camera.width), g.gate.mean.y * S(0.5) * S(camera.height)};
-
-  const auto& j = made.jacobian.jacobian;
-  const Mat3<S> dL_drotation = {j.r0.x * dL_daxes.r0, j.r1.y * dL_daxes.r1,
-                                j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1};
-  out.camera = {gaussian.mean, dL_dview, dL_drotation, by_pixel.clip, S(-1) * g.color};
+  out.camera = {gaussian.mean, by.view, way.rotation_backward(made.point.jacobian, dL_daxes), by.pixel.clip,
+                S(-1) * g.color};
   return out;
+}
+
+template <class S>
+DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const PinholeCamera<S>& camera,
+                                              const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
+  return project_backward_by(ByMatrix<S>{camera}, gaussian, rules, g);
+}
+
+template <class S>
+DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const Camera<S>& camera,
+                                              const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
+  if (camera.lens.model == LensModel::kPinhole) return project_backward_by(ByMatrix<S>{camera}, gaussian, rules, g);
+  return project_backward_by(ByLens<S>{camera}, gaussian, rules, g);
 }
 
 }  // namespace dsmoe

@@ -8,7 +8,7 @@
 // To project on one device and blend on another, call the two halves:
 //
 //     cpu::project(frame);                        // the footprints: saved.projected, saved.features and images.radii
-//     cpu::blend_footprints(other, heap);         // the images of some footprints, those of several frames maybe
+//     cpu::blend_footprints(other, heap);         // the images of some footprints, of several frames maybe
 //     cpu::blend_footprints_backward(other, image_gradients, footprint_gradients);
 //     cpu::project_backward(frame, footprint_gradients, gradients);
 //

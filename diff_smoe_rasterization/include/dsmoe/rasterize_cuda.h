@@ -42,6 +42,7 @@ template <class S> struct DeviceCamera {
   const S* view = nullptr;        // [4, 4]
   const S* projection = nullptr;  // [4, 4]
   const S* position = nullptr;    // [3]
+  Lens<S> lens;                   // as Camera has it, on the host
 };
 
 // Numbers between the rows of `features`: rows begin at multiples of four, so that they load as vectors.

@@ -12,6 +12,7 @@
 
 #include <ATen/ATen.h>
 
+#include <array>
 #include <cstdint>
 #include <memory>
 #include <optional>
@@ -57,6 +58,12 @@ struct GaussianRasterizationSettings {
   double low_pass = 0.3;                          // px^2 added to the variances on the image
   std::optional<double> faint_below;              // `smoe` and `smoe_eq7`: faint pairs and tails count if the gate
                                                   // sum of near ones is below this; absent: 0.25 and 2, everywhere
+  std::string camera_model = "pinhole";  // a name of kLensNames (lens.h). But for "pinhole", viewmatrix has all
+                                         // of the pose, projmatrix is not read and gets no gradient, and the
+                                         // focal lengths are image_width / (2 tanfovx) and so on
+  std::vector<double> distortion;        // as LensCalibration (lens.h) has it
+  std::optional<std::array<double, 2>> principal_point;  // pixels; the centre of the first pixel is (0.5, 0.5). Absent:
+                                                         // of the image. A pinhole's is in projmatrix
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.
@@ -129,7 +136,8 @@ std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, co
                                                    const GaussianRasterizationSettings& settings,
                                                    const RasterizeArguments& arguments = {});
 
-/// The settings of a pinhole camera, transposed matrices included, as Python's function of this name. K: [3, 3]
+/// The settings of a camera, transposed matrices included, as Python's function of this name; for a lens other than a
+/// pinhole set camera_model, distortion and principal_point of the result. K: [3, 3]
 /// intrinsics in pixels; as in COLMAP, the centre of the top left pixel is (0.5, 0.5). R, t: [3, 3] and [3], world to
 /// view: x_view = R x_world + t, with x right, y down, z forward. bg: [C]; the matrices get its type and its device.
 /// They have gradients with respect to R, t and, in the projection, K.

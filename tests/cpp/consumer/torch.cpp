@@ -302,6 +302,30 @@ TEST(Torch, SettingsOfACameraPutAGaussianWhereItIs) {
       [&] { dsmoe::settings_from_camera(K, 2 * at::eye(3, at::kDouble), t, 48, 32, at::zeros({3})); }, "R must be a");
 }
 
+// fx theta + cx with theta = atan(1 / 2): column 39.05, where a pinhole has 40.5.
+TEST(Torch, ALensPutsAGaussianWhereItIs) {
+  const at::Tensor K = at::eye(3, at::kDouble);
+  K[0][0].fill_(40), K[1][1].fill_(50);
+  auto settings =
+      dsmoe::settings_from_camera(K, at::eye(3, at::kDouble), at::zeros({3}, at::kDouble), 48, 32, at::zeros({3}), 0);
+  settings.camera_model = "fisheye";
+  settings.principal_point = {20.5, 12.5};
+  const at::Tensor mean = at::zeros({1, 3});
+  mean[0][0].fill_(1), mean[0][2].fill_(2);
+  RasterizeArguments arguments;
+  arguments.colors_precomp = at::ones({1, 3});
+  arguments.scales = at::full({1, 3}, 0.01);
+  arguments.rotations = at::eye(1, 4);
+  const auto render = [&] { return dsmoe::rasterize(mean, at::full({1}, 0.9), settings, arguments).color; };
+  EXPECT_EQ(render()[0].flatten().argmax().item<int64_t>(), 12 * 48 + 39);
+  settings.distortion = {0.1, 0.2, 0.3};
+  expect_error<c10::ValueError>(render, "rasterize: distortion has 3 numbers; it must have 0, 1, 2 or 4");
+  settings.camera_model = "fish";
+  expect_error<c10::ValueError>(render, "rasterize: camera_model is 'fish'; it must be one of pinhole");
+  settings.camera_model = "pinhole";
+  expect_error<c10::ValueError>(render, "rasterize: distortion is given, but camera_model is 'pinhole'");
+}
+
 TEST(Torch, SettingsOfACameraHaveTheCoresMatrices) {
   const at::Tensor K = at::zeros({3, 3}, at::kDouble), R = at::zeros({3, 3}, at::kDouble);
   K[0][0].fill_(40), K[1][1].fill_(50), K[0][2].fill_(20.5), K[1][2].fill_(12.5), K[2][2].fill_(1);

@@ -113,7 +113,7 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   const Camera<float>& camera = scene.camera;
   cuda::Frame<float> frame = {scene.inputs(),
                               {camera.width, camera.height, camera.tan_fov_x, camera.tan_fov_y, camera.near,
-                               camera.view, camera.projection, camera.position},
+                               camera.view, camera.projection, camera.position, camera.lens},
                               scene.raster_config(),
                               out.rendering.images(),
                               {}};
@@ -291,6 +291,16 @@ TYPED_TEST(KernelsIn, EqualTheCpuWithOtherColoursAndDepth) {
   this->expect(scene);
 }
 
+TYPED_TEST(KernelsIn, EqualTheCpuThroughEveryLens) {
+  for (const Lens<double>& lens : make_lenses(41, 23)) {
+    for (Scene<double> scene : {crowd(), with_degree_3(crowd(), false)}) {
+      scene.camera.lens = lens;
+      scene.config.depth = lens.model == LensModel::kFisheye;
+      this->expect(scene);
+    }
+  }
+}
+
 TYPED_TEST(KernelsIn, EqualTheCpuOnLongLists) { this->expect(long_lists()); }
 
 TYPED_TEST(KernelsIn, EqualTheCpuWhereTheHalvesOfASquareLeaveAListApart) {
@@ -385,7 +395,8 @@ TEST(Kernels, OrderFootprintsByTheirDepthsAlsoNegativeOnes) {
 
 // What the views of a batch see, and the gradients by the Gaussians; for three cameras, side by side.
 struct BatchResults {
-  explicit BatchResults(const Scene<float>& scene) : gradient(scene) {
+  // lenses: of the first views.
+  BatchResults(const Scene<float>& scene, const std::vector<Lens<double>>& lenses) : gradient(scene) {
     for (int v = 0; v < 3; ++v) {
       Camera<float> camera = scene.camera;
       for (int row = 0; row < 2; ++row) camera.view[12 + row] += 0.7f * static_cast<float>(v);
@@ -393,6 +404,7 @@ struct BatchResults {
         camera.projection[12 + row] +=
             0.4f * static_cast<float>(v) * (camera.projection[row] + camera.projection[4 + row]);
       }
+      if (v < static_cast<int>(lenses.size())) camera.lens = lenses[v].as<float>();
       cameras.push_back(camera);
       radii.emplace_back(scene.count, -5), offsets.emplace_back(num_view_blocks(scene.count) + 1, -5);
     }
@@ -427,20 +439,21 @@ struct BatchResults {
   SceneGradient<float> gradient;
 };
 
-BatchResults batch_on_cpu(const Scene<float>& scene) {
-  BatchResults out(scene);
+BatchResults batch_on_cpu(const Scene<float>& scene, const std::vector<Lens<double>>& lenses = {}) {
+  BatchResults out(scene, lenses);
   cpu::ViewBatch batch;
   for (const Camera<float>& camera : out.cameras) batch.views.emplace_back().camera = camera;
   out.run(scene, batch, 0, cpu::count_rows, cpu::project_rows, cpu::project_rows_backward);
   return out;
 }
 
-BatchResults batch_by_kernels(const Scene<float>& scene, int fewer = 0) {
-  BatchResults out(scene);
+BatchResults batch_by_kernels(const Scene<float>& scene, int fewer = 0, const std::vector<Lens<double>>& lenses = {}) {
+  BatchResults out(scene, lenses);
   cuda::ViewBatch batch;
   for (const Camera<float>& camera : out.cameras) {
-    batch.views.emplace_back().camera = {camera.width, camera.height, camera.tan_fov_x,  camera.tan_fov_y,
-                                         camera.near,  camera.view,   camera.projection, camera.position};
+    batch.views.emplace_back().camera = {camera.width,      camera.height,   camera.tan_fov_x,
+                                         camera.tan_fov_y,  camera.near,     camera.view,
+                                         camera.projection, camera.position, camera.lens};
   }
   out.run(
       scene, batch, fewer, [](const auto& batch) { cuda::count_rows(batch, {}); },
@@ -454,14 +467,22 @@ std::vector<double> widened(const std::vector<float>& numbers) { return {numbers
 TEST(Kernels, TakeTheViewsOfABatchAsTheCpu) {
   Scene<double> no_shs = make_scene(4, 300, 41, 23);
   no_shs.sh_degree = 0, no_shs.dc = no_shs.shs, no_shs.dc.resize(3 * no_shs.count), no_shs.shs.clear();
-  for (Scene<double> of : {with_degree_3(make_scene(3, 300, 41, 23), false), make_scene(3, 129, 41, 23), no_shs,
-                           with_degree_3(make_scene(3, 300, 41, 23), true), make_scene(3, 0, 41, 23)}) {
+  const std::vector<Lens<double>> lenses = make_lenses(41, 23), mixed = {lenses[2], {}, lenses[1]};
+  const Scene<double> known = with_degree_3(make_scene(3, 300, 41, 23), false), staged = make_scene(3, 129, 41, 23);
+  for (auto [of, through] : std::vector<std::pair<Scene<double>, std::vector<Lens<double>>>>{
+           {known, {}},
+           {known, mixed},
+           {staged, {}},
+           {staged, mixed},
+           {no_shs, {}},
+           {with_degree_3(make_scene(3, 300, 41, 23), true), {}},
+           {make_scene(3, 0, 41, 23), {}}}) {
     if (of.count > 0) (of.dc.empty() ? of.shs : of.dc)[3 * 40] = NAN;  // that Gaussian has a row, and is culled
     const Scene<float> scene = convert<float>(of);
-    const BatchResults expected = batch_on_cpu(scene), actual = batch_by_kernels(scene);
+    const BatchResults expected = batch_on_cpu(scene, through), actual = batch_by_kernels(scene, 0, through);
     for (const auto order : {emulator::Order::kBackward, emulator::Order::kShuffled}) {
       emulator::run_in(order);
-      const BatchResults other = batch_by_kernels(scene);
+      const BatchResults other = batch_by_kernels(scene, 0, through);
       EXPECT_EQ(other.offsets, actual.offsets);
       EXPECT_EQ(other.features, actual.features);
       EXPECT_EQ(other.gates, actual.gates);

@@ -94,6 +94,8 @@ TEST(JsonViews, RefuseWithPlaceAndReason) {
   expect_refused(kInria, "[0, 0, -1]", "[0, 0, 1]", ": camera 0: `rotation`", "mirrors");
   expect_refused(kInria, "[0, 0, -1]", "[0, 0, 0]", ": camera 0: `rotation`", "not a rotation");
   expect_refused(kInria, "\"img_name\"", "\"name\"", ": camera 0", "`img_name` is missing");
+  expect_refused(kInria, "\"id\": 0", "\"camera_model\": \"fisheye\"", ": camera 0: `camera_model`",
+                 "must be absent: only pinhole cameras can be rendered");
   expect_refused(kTransforms, "\"k1\": 0", "\"k1\": 0.1", ": `k1`", "distortion");
   expect_refused(kTransforms, "\"frames\"", "\"views\"", "", "`frames` is missing");
   expect_refused(kTransforms, "\"a.png\"", "3", ": frame 0: `file_path`", "must be a text");

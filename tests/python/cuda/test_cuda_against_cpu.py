@@ -1,6 +1,8 @@
 """The CUDA backend against the CPU backend in float64: images, radii and all gradients, in all modes."""
 from __future__ import annotations
 
+import functools
+
 import pytest
 import torch
 from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
@@ -30,6 +32,12 @@ def crowd(mode, **options):
     return random_scene(mode, 3000, 160, 107, scale=0.03, **options)
 
 
+def through(lens, mode):
+    """Around the camera if the lens sees around; of degree 3, for which kernels are compiled."""
+    position = (0.4, -0.3, -4.0) if lens["camera_model"] in ("orthographic", "opencv") else (0.4, -0.3, -1.5)
+    return crowd(mode, degree=3, position=position, near=0.5).with_settings(**lens)
+
+
 def one_covers_all(mode):
     """A Gaussian whose footprint is the whole image, before and behind many that are small."""
     scene = crowd(mode, degree=1)
@@ -57,6 +65,13 @@ SCENES = {
     "antialiased_covariances": lambda mode: crowd(mode, covariance="cov3D", degree=1, antialiasing=True),
     "alpha_min": lambda mode: crowd(mode, degree=1, alpha_min=1 / 255),
     "principal_point": lambda mode: crowd(mode, degree=0, principal_point=(21.3, -9.6)),
+    **{f"lens_{lens['camera_model']}": functools.partial(through, lens) for lens in (
+        dict(camera_model="orthographic", tanfovx=2.0, tanfovy=1.4),
+        dict(camera_model="opencv", distortion=(-0.2, 0.05, 0.01, -0.02, 0.03, 0.01, 0.02, -0.01),
+             principal_point=(84.0, 51.0)),
+        dict(camera_model="fisheye", distortion=(0.02, -0.01, 0.003, -0.0002)),
+        dict(camera_model="thin_prism_fisheye", distortion=(0.02, -0.01, 0.003, -0.002, 0.01, 0.001, 0.02, -0.01)),
+        dict(camera_model="equirectangular"))},
     "one_covers_all": one_covers_all,
     "saturated": saturated,
     "one_pixel": lambda mode: random_scene(mode, 300, 1, 1, scale=0.3, degree=1, fov_x=0.1),

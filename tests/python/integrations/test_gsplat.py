@@ -11,7 +11,7 @@ from comparison import assert_all_close, assert_close, one_thread, threshold_mar
 from devices import on_the_cpu, random_normal
 from scenes import camera_settings, random_scene, with_gates
 
-from diff_smoe_rasterization import rasterize, reference
+from diff_smoe_rasterization import project_gaussians, rasterize, reference
 from diff_smoe_rasterization.integrations.gsplat import (
     compute_relocation,
     quat_scale_to_covar_preci,
@@ -110,6 +110,46 @@ def test_a_batch_of_cameras_is_the_references(mode, degree, rasterize_mode):
     assert torch.equal(meta["radii"].cpu(), torch.stack([radii, radii], 2))
     assert (meta["width"], meta["height"], meta["n_cameras"]) == (WIDTH, HEIGHT, 2)
     assert meta["gaussian_ids"] is None and meta["camera_ids"] is None
+
+
+RADIAL = torch.tensor([[-0.2, 0.05, 0.03, 0.01, 0.02, -0.01], [0.1, 0.02, -0.01, 0.02, 0.01, 0.005]], device="cpu")
+TANGENTIAL = torch.tensor([[0.01, -0.02], [-0.005, 0.01]], device="cpu")
+PRISM = torch.tensor([[0.01, -0.005, 0.004, 0.003], [0.002, 0.001, -0.004, 0.002]], device="cpu")
+
+
+@pytest.mark.parametrize("camera_model, coefficients, own", [
+    ("ortho", {}, ("orthographic", [()] * 2)), ("fisheye", {}, ("fisheye", [()] * 2)),
+    ("fisheye", dict(radial_coeffs=RADIAL[:, :4]), ("fisheye", RADIAL[:, :4].tolist())),
+    ("pinhole", dict(radial_coeffs=RADIAL, tangential_coeffs=TANGENTIAL, thin_prism_coeffs=PRISM),
+     ("opencv", torch.cat([RADIAL[:, :2], TANGENTIAL, RADIAL[:, 2:], PRISM], 1).tolist())),
+    ("pinhole", dict(tangential_coeffs=TANGENTIAL), ("opencv", [[0, 0, *p] for p in TANGENTIAL.tolist()]))])
+def test_lenses_are_the_references(camera_model, coefficients, own):
+    scene = random_scene("smoe", 60, seed=31, channels=3, scale=0.05)
+    model, distortions = own
+    cameras = [camera._replace(camera_model=model, distortion=tuple(distortion),
+                               principal_point=(WIDTH / 2 + x, HEIGHT / 2 + y))
+               for camera, distortion, (x, y) in zip(make_cameras("smoe", 3), distortions, PRINCIPAL_POINTS)]
+    if camera_model == "ortho":
+        cameras = [camera._replace(tanfovx=2.0, tanfovy=1.5) for camera in cameras]
+    renders, _, meta = rasterization(**arguments_of(scene, cameras), blend_mode="smoe", camera_model=camera_model,
+                                     **{name: value.to(scene.inputs["means3D"]) for name, value in
+                                        coefficients.items()})
+    expected = reference_renderings(scene.inputs, cameras)
+    assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
+    for camera, settings in enumerate(cameras):
+        rotations = torch.nn.functional.normalize(scene.inputs["rotations"])
+        prints = project_gaussians(settings=settings, **{**scene.inputs, "means2D": None, "rotations": rotations})
+        seen = prints.radii > 0
+        assert seen.any() and torch.equal(meta["radii"][camera, :, 0], prints.radii)
+        assert_close(meta["means2d"][camera][seen], prints.means2D[seen] + 0.5, TOLERANCE, "means2d")
+        assert_close(meta["depths"][camera][seen], prints.depths[seen], TOLERANCE, "depths")
+
+
+def test_coefficients_that_a_lens_has_not_are_refused(small):
+    with pytest.raises(NotImplementedError, match="tangential_coeffs is given; camera_model 'fisheye' has none here"):
+        rasterization(**small, camera_model="fisheye", tangential_coeffs=torch.zeros(2, 2))
+    with pytest.raises(ValueError, match=r"radial_coeffs has shape \[2, 4\]; it must be \[2, 6\]"):
+        rasterization(**small, radial_coeffs=torch.zeros(2, 4))
 
 
 @pytest.mark.parametrize("render_mode, width", [("RGB", 3), ("D", 1), ("ED", 1), ("RGB+D", 4), ("RGB+ED", 4)])
@@ -321,8 +361,8 @@ def small():
 
 
 @pytest.mark.parametrize("name, value", [
-    ("sparse_grad", True), ("distributed", True), ("camera_model", "fisheye"), ("with_ut", True),
-    ("rolling_shutter", 1), ("radial_coeffs", torch.zeros(2, 6)), ("global_z_order", False),
+    ("sparse_grad", True), ("distributed", True), ("camera_model", "ftheta"), ("with_ut", True),
+    ("rolling_shutter", 1), ("ftheta_coeffs", torch.zeros(2, 6)), ("global_z_order", False),
     ("extra_signals", torch.zeros(5, 1))])
 def test_what_is_not_offered_is_refused_by_name(small, name, value):
     with pytest.raises(NotImplementedError, match=name):

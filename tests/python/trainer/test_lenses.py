@@ -9,15 +9,18 @@ import subprocess
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.optimize import brentq
 
-from diff_smoe_rasterization import io
+from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from dsmoe.cli import main
 from dsmoe.config import TrainConfig
 from dsmoe.errors import SceneError
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.lens import lens_of
+from dsmoe.scenes.modelfolder import _camera
+from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
 from dsmoe.system.files import PART
 
@@ -105,6 +108,84 @@ def test_every_model_becomes_a_pinhole_camera(tmp_path, monkeypatch, model, two_
     # Rounding twice, 1 level, and a half 32nd pixel of at most 10 levels; a shift by half a pixel would be 4 levels.
     difference = np.abs(view.image.permute(1, 2, 0).numpy() - colour(x, y))[inner]
     assert difference.max() < 2.5 and inner.mean() > 0.6
+
+
+def fisheye_scene(folder, model="OPENCV_FISHEYE", k=(0.03, -0.01, 0.004, -0.001), count=8):
+    """A COLMAP scene of a cloud of Gaussians before and beside cameras of 170 degrees and more, and its points."""
+    generator = torch.Generator().manual_seed(3)
+    directions = torch.nn.functional.normalize(torch.randn(60, 3, generator=generator), dim=1)
+    means = 3 * torch.cat([directions[:, :2], directions[:, 2:].abs() - 0.2], 1)
+    colors = torch.rand(60, 3, generator=generator)
+    params = [30.0, 31.0, CX, CY, *k]
+    cameras = {1: io.ColmapCamera(1, model, WIDTH, HEIGHT, np.array(params))}
+    images = []
+    os.makedirs(folder / "images")
+    for index in range(count):
+        place = torch.tensor([0.25 * math.cos(index), 0.25 * math.sin(index), 0.1 * index])
+        settings = settings_from_camera([[30, 0, CX], [0, 31, CY], [0, 0, 1]], torch.eye(3), -place, WIDTH, HEIGHT,
+                                        camera_model=lens_of(model, True, {}).camera_model, distortion=k)
+        color = rasterize(means, torch.full((60,), 0.9), settings, colors_precomp=colors,
+                          scales=torch.full((60, 3), 0.25), rotations=torch.tensor([[1.0, 0, 0, 0]] * 60)).color
+        Image.fromarray((color.clamp(0, 1).permute(1, 2, 0) * 255).round().byte().numpy()).save(
+            folder / "images" / f"{index}.png")
+        images.append(io.ColmapImage(index + 1, f"{index}.png", 1, np.array([1.0, 0, 0, 0]), -place.double().numpy()))
+    points = io.Points(means.double().numpy(), (colors * 255).byte().numpy())
+    io.write_colmap(str(folder / "sparse" / "0"), io.ColmapModel(cameras, images, points))
+    return str(folder)
+
+
+@pytest.mark.parametrize("model, k", [("OPENCV_FISHEYE", (0.03, -0.01, 0.004, -0.001)), ("THIN_PRISM_FISHEYE", (
+    0.03, -0.01, 0.002, -0.001, 0.004, -0.001, 0.003, -0.002)), ("FULL_OPENCV", (
+        -0.1, 0.05, 0.003, 0.002, 0.01, 0.02, -0.01, 0.005))])
+def test_native_lenses_are_those_of_colmap(tmp_path, model, k):
+    folder = write_scene(tmp_path, model, [FX, FY, CX, CY, *k], Image.new("RGB", (WIDTH, HEIGHT), (9, 8, 7)))
+    view = load(folder, lenses="native").train[0]
+    settings = view.camera.settings(torch.zeros(3), 0, "smoe")
+    assert settings.camera_model == model.lower().replace("opencv_", "").replace("full_", "")
+    assert settings.distortion == k and settings.principal_point == (CX, CY)
+    assert view.mask is None and not (tmp_path / ".dsmoe_cache").exists() and (view.image[0] == 9).all()
+
+
+def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
+    k = (0.03, -0.01, 0.004, -0.001)
+    folder = fisheye_scene(tmp_path / "scene", "OPENCV_FISHEYE", k)
+    output = str(tmp_path / "out")
+    assert main(["train", folder, "-o", output, "--lenses", "native", "--iterations", "200", "--blend-mode", "smoe",
+                 "--background-gate", "0", "--device", "cpu", "--test-every", "4"]) == 0
+    assert "stay as they are" in capsys.readouterr().out
+    with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
+        row = json.load(file)
+    row = row[0] if isinstance(row, list) else row
+    assert row["protocol"]["lenses"] == "native"
+    assert row["psnr"] > 25, "33.8 dB after 1000; as a pinhole it would not even show what lies beside the camera"
+    assert main(["eval", output, "--device", "cpu"]) == 0
+    assert f"{row['psnr']:.2f}" in capsys.readouterr().out
+    assert main(["render", output, "--split", "test", "-o", str(tmp_path / "test"), "--device", "cpu"]) == 0
+    shown, photograph = (np.asarray(Image.open(path).convert("RGB"), np.float64) for path in (
+        next((tmp_path / "test").glob("**/0.png")), tmp_path / "scene" / "images" / "0.png"))
+    assert 10 * math.log10(255**2 / ((shown - photograph) ** 2).mean()) > 22
+    with open(os.path.join(output, "cameras.json"), encoding="utf-8") as file:
+        recorded = json.load(file)[0]
+    assert recorded["camera_model"] == "fisheye" and tuple(recorded["distortion"]) == k
+    assert _camera(recorded).lens.coefficients == k
+
+
+def test_lenses_that_opencv_does_not_undistort_name_the_way(tmp_path):
+    folder = write_scene(tmp_path, "THIN_PRISM_FISHEYE", [FX, FY, CX, CY, 0.01, 0, 0, 0, 0, 0, 0, 0],
+                         Image.new("RGB", (WIDTH, HEIGHT)))
+    with pytest.raises(SceneError, match="camera model THIN_PRISM_FISHEYE; --lenses native trains through it"):
+        load(folder)
+
+
+def test_a_panorama_of_transforms_json(tmp_path):
+    Image.new("RGB", (64, 32), (90, 120, 30)).save(tmp_path / "0.png")
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_model": "EQUIRECTANGULAR", "frames": [frame]}))
+    camera = load(tmp_path, lenses="native", test_every=0).train[0].camera
+    settings = camera.settings(torch.zeros(3), 0, "smoe")
+    assert settings.camera_model == "equirectangular" and (camera.width, camera.height) == (64, 32)
+    orbit = orbit_of_cameras([camera]).cameras(2, camera)[0]
+    assert orbit.lens is None and orbit.fx == pytest.approx(32), "90 degrees"
 
 
 @needs_opencv

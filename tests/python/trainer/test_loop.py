@@ -4,7 +4,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -200,37 +199,25 @@ def test_a_row_says_that_there_were_masks(tiny_config, scene):
     assert rows[1]["ssim"] == pytest.approx(rows[0]["ssim"], abs=1e-5)
 
 
-def test_half_the_size_until_a_step(tiny_config, scene, monkeypatch):
-    """Means of four pixels, of the same camera; what decides looks at whole images."""
-    config = tiny_config.changed(half_until_iter=20, strategy="importance", budget=60, strategy_options="removals=4")
-    trainer = Trainer(config, scene)
-    whole = {view.camera.name: view for view in scene.train}
-    looks = []
-    monkeypatch.setattr(trainer.strategy, "_add", lambda view, look: looks.append(view.image.shape))
-    while trainer.iteration < 24:
-        step = trainer.step()
-        shape = (3, 12, 16) if trainer.iteration <= 20 else (3, 24, 32)
-        assert step.rendering.color.shape == step.target.shape == shape
-        if trainer.iteration <= 20:
-            blocks = whole[step.view.camera.name].image.double().reshape(3, 12, 2, 16, 2).mean(dim=(2, 4))
-            assert (step.target - blocks).abs().max() <= 0.5, "rounded"
-    assert set(looks) == {(3, 24, 32)}, "removals at 16, 19 and 22"
+def test_a_step_makes_no_settings_of_a_training_view(tiny_config, scene, monkeypatch):
+    """They are there from the start, and those that its camera gives; a step would wait for the device."""
+    trainer = Trainer(tiny_config, scene)
+    for view in trainer.scene.train:
+        expected = view.camera.settings(torch.zeros(3), 0, "smoe")
+        made = trainer.renderer.settings_of(view.camera)
+        for name in ("viewmatrix", "projmatrix", "campos", "bg"):
+            own, other = getattr(made, name), getattr(expected, name)
+            assert torch.equal(own, other) and own.is_contiguous() and own.data_ptr() % 16 == 0
+        assert made._replace(**{name: None for name in ("viewmatrix", "projmatrix", "campos", "bg", "background_gate")}
+                             ) == expected._replace(viewmatrix=None, projmatrix=None, campos=None, bg=None,
+                                                    background_gate=None)
 
+    def forbidden(*arguments):
+        raise AssertionError("settings are made")
 
-def test_half_a_camera_sees_the_same(scene):
-    """An odd last column is left out, and a point lies at half its pixel coordinates."""
-    camera = dataclasses.replace(scene.train[0].camera, width=33)
-    view = dataclasses.replace(scene.train[0], camera=camera, image=torch.zeros(3, 24, 33, dtype=torch.uint8),
-                               mask=torch.full((1, 24, 33), 255, dtype=torch.uint8))
-    half = view.halved()
-    assert half.image.shape == (3, 12, 16) and half.mask.shape == (1, 12, 16) and (half.mask == 255).all()
-    assert (half.camera.width, half.camera.height) == (16, 12)
-    x, y, z = camera.rotation @ np.array([0.1, -0.2, 0.3]) + camera.translation
-    for one, factor in ((camera, 1), (half.camera, 2)):
-        pixel = np.array([one.fx * x / z + one.cx, one.fy * y / z + one.cy]) * factor
-        np.testing.assert_allclose(pixel, [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], rtol=1e-12)
-    tiny = dataclasses.replace(view, camera=dataclasses.replace(camera, height=1))
-    assert tiny.halved() is tiny
+    monkeypatch.setattr(type(view.camera), "settings", forbidden)
+    for _ in range(9):
+        trainer.step()
 
 
 def test_the_last_iteration_does_not_step(tiny_config, scene):

@@ -84,7 +84,7 @@ def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
 
 @pytest.mark.parametrize("options", [
     dict(blend_mode="alpha"), dict(blend_mode="smoe", background_gate="learned", random_background=True),
-    dict(blend_mode="alpha", strategy="mcmc", budget=60), dict(blend_mode="alpha", half_until_iter=21),
+    dict(blend_mode="alpha", strategy="mcmc", budget=60),
     dict(blend_mode="smoe", strategy="importance", budget=60, strategy_options="views=3,moves=0.2", iterations=50)],
     ids=str)
 @pytest.mark.parametrize("masked", [False, True])
@@ -163,15 +163,6 @@ def test_a_kind_that_comes_no_more_makes_place_for_another():
     later = graphs.run(memory, views_of(list(new), 2 + IDLE // MOST_KINDS + 1))
     assert not any(later[:IDLE - MOST_KINDS]) and all(later[-MOST_KINDS:])
     assert sorted(graphs.captures) == [*old, *new]
-
-
-def test_after_a_change_of_the_image_size_steps_are_launched_as_long_as_at_the_start():
-    """Lists of the new size are learned from them."""
-    graphs, memory = Counted(), [torch.zeros(3)]
-    first = graphs.run(memory, [0] * (WARM_UP + 9)).index(True)
-    graphs.warm_up()
-    assert graphs.run(memory, [1] * (WARM_UP + 9)).index(True) == first == WARM_UP
-    assert graphs.run(memory, [2] * 9).index(True) == 1, "without that the second step is captured"
 
 
 def test_kinds_that_never_repeat_are_not_all_remembered():

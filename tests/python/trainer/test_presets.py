@@ -42,11 +42,14 @@ def test_presets_are_of_importance(tiny_scene, tmp_path, capsys, preset):
 
 def test_presets_have_defaults():
     assert with_preset({"seed": 3}, None, "cuda") == {"seed": 3, "strategy": "importance"}
-    fast = {"strategy": "importance", "strategy_options": "overshoot=1.5,removals=4"}
-    assert with_preset({}, "fast", "cuda") == {**fast, "iterations": 7000, "densify_until_iter": 2450}
-    assert with_preset({}, "fast", "cpu") == {**fast, "iterations": 3000, "densify_until_iter": 1050}
+    assert with_preset({}, "fast", "cuda") == {
+        "strategy": "importance", "strategy_options": "overshoot=1.5,removals=4,pace=10", "iterations": 8400,
+        "densify_until_iter": 2352}
+    assert with_preset({}, "fast", "cpu") == {
+        "strategy": "importance", "strategy_options": "overshoot=1.5,removals=4", "iterations": 3000,
+        "densify_until_iter": 1050}
     best = {"strategy": "importance", "iterations": 60_000, "strategy_options": "views=255"}
-    assert with_preset({}, "best", "cuda") == {**best, "scaling_lr": 0.02}
+    assert with_preset({}, "best", "cuda") == best
     assert with_preset({"scaling_lr": 0.01}, "best", "cpu") == {**best, "scaling_lr": 0.01}
 
 
@@ -56,7 +59,7 @@ def test_best_scales_all_milestones_and_takes_given_options(tiny_scene, tmp_path
     assert main(["train", *words]) == 0
     config = TrainConfig.load(output)
     assert (config.iterations, config.densify_until_iter, config.position_lr_max_steps) == (30, 15, 30)
-    assert (config.strategy_options, config.scaling_lr, config.budget) == ("views=255", 0.02, 70)
+    assert (config.strategy_options, config.budget) == ("views=255", 70)
 
 
 def test_without_options_importance_takes_a_number_that_the_scene_says(tiny_scene, tmp_path, capsys, monkeypatch):

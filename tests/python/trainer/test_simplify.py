@@ -119,9 +119,8 @@ def test_removals_begin_at_once_and_nothing_grows(run):
     assert grows.growth_ends == 107 and grows.removals[0] == 109, "8 / 15 and 8.2 / 15"
 
 
-def test_what_no_view_needs_goes_first(run, monkeypatch):
+def test_what_no_view_needs_goes_first(run):
     """As far as the budget allows."""
-    monkeypatch.setattr("dsmoe.training.importance_strategy.DROPS_UNNEEDED", True)
     scene = load_scene(run.changed(init=ply_of(run)), progress=False)
     gaussians = scene.start.gaussians
     means = gaussians.means3D.copy()
@@ -316,12 +315,23 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
     assert "neither photographs nor cameras are known" in capsys.readouterr().err and not os.path.exists(output)
 
 
+def test_training_and_test_views_may_share_names(run, tmp_path):
+    """As those of NeRF-synthetic scenes do in cameras.json."""
+    folder = model_folder(run, tmp_path)
+    path = tmp_path / "cameras.json"
+    entries = json.loads(path.read_text())
+    entries[3]["img_name"] = entries[0]["img_name"] = "r_0"
+    path.write_text(json.dumps(entries))
+    layout = read_layout(TrainConfig(scene=folder, test_every=0))
+    assert sorted(image.camera.name for image in layout.train) == sorted(
+        ["r_0-0", "r_0-3", *(entry["img_name"] for entry in entries if entry["img_name"] != "r_0")])
+
+
 @pytest.mark.parametrize("edit, words", [
     (lambda entry: entry.pop("fx"), "'fx' is missing"),
     (lambda entry: entry.update(rotation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "is not a rotation"),
     (lambda entry: entry.update(position=[0, float("nan"), 0]), "must be finite"),
     (lambda entry: entry.update(width=0), "must be above 0"),
-    (lambda entry: entry.update(img_name="view_002.png"), "two cameras have one `img_name`"),
 ])
 def test_wrong_cameras_are_named(run, tmp_path, edit, words):
     folder = model_folder(run, tmp_path)

@@ -3,7 +3,7 @@
 //
 //   State<Real>    what it knows of a pixel, or of a pack of pixels; `for_each` visits its kNum numbers
 //   begin<kMode>(pixel)   the State in front of all pairs; outside the image all its numbers are 0
-//   Sums<Real>     what it sums over the pixels of each Gaussian; `for_each` visits those of several side by side. Or
+//   Sums<Real>     what it sums over the pixels of each Gaussian; `for_each` visits several Gaussians' side by side. Or
 //                  NoSums
 //   visit<kMode>(walked, state, pair, sums)   moves a pixel past a pair. Returns whether the pair adds to the sums
 //

@@ -94,6 +94,10 @@ template <class S> struct AdamStep {
   const bool* visible;  // [rows] which rows of every tensor are stepped, or null: all are
 };
 
+// What both backends refuse: null pointers, by name, and sizes that would have them read elsewhere. Throws
+// std::invalid_argument.
+template <class S> void refuse_adam(const char* function, const std::vector<AdamTensor<S>>& tensors);
+
 namespace cpu {
 
 // Steps the parameters and their moments in place. All pointers are to memory of the host.
@@ -154,7 +158,7 @@ template <class S> struct LazyAdamStep {
   int64_t num_rows;      // N
   int32_t* marks;        // [N] written where radii is above 0; these rows are up to date
   const int32_t* radii;  // [N] above 0 in rows that have a gradient
-  AdamRates<S>* rates;   // [steps + 1, num_tensors] of each step; those of this one are written
+  AdamRates<S>* rates;   // [steps + 1, num_tensors] of each step; this step's are written
   AdamRates<S> new_rates[kLazyAdamMaxTensors];
   int num_tensors;
   int32_t steps;                    // made before this one
@@ -164,6 +168,10 @@ template <class S> struct LazyAdamStep {
   DSMOE_HD int32_t num_steps() const { return given_steps != nullptr ? static_cast<int32_t>(*given_steps) : steps; }
   DSMOE_HD AdamRates<S> new_rate(int t) const { return given_rates != nullptr ? given_rates[t] : new_rates[t]; }
 };
+
+// As refuse_adam.
+template <class S> void refuse_catch_up(const char* function, const LazyAdam<S>& adam);
+template <class S> void refuse_note_step(const char* function, const LazyAdamStep<S>& step);
 
 namespace cpu {
 

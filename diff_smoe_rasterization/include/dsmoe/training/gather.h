@@ -19,6 +19,11 @@ struct GatherRows {
   int64_t count;
 };
 
+// What both backends refuse: null pointers, by name, and sizes that would have them read elsewhere. Throws
+// std::invalid_argument.
+template <class S>
+void refuse_gather(const char* function, const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows);
+
 namespace cpu {
 
 template <class S>

@@ -8,7 +8,7 @@
 
 namespace dsmoe {
 
-// From the numbers that an optimizer moves freely to those of a Gaussian: opacity = sigmoid(logit), scale = exp(log),
+// From the numbers that an optimizer moves freely to a Gaussian's: opacity = sigmoid(logit), scale = exp(log),
 // rotation = quaternion / |quaternion|. Each backward function returns dL/dinput from the output and dL/doutput.
 
 template <class S> DSMOE_HD S sigmoid(S logit) { return S(1) / (S(1) + exp(-logit)); }
@@ -201,7 +201,7 @@ template <class S> struct GaussianAdam {
   ActivatedTensor<S> tensors[kGaussianAdamTensors];
   int64_t num_gaussians;            // N
   const int32_t* radii;             // [N] above 0 if a Gaussian was seen; the others have no gradient
-  const AdamRates<S>* given_rates;  // [kGaussianAdamTensors] in place of those of the tensors, or null
+  const AdamRates<S>* given_rates;  // [kGaussianAdamTensors] in place of the tensors', or null
   AdamConstants<S> constants;
 
   // Of tensor t.
@@ -232,6 +232,8 @@ DSMOE_HD void step_quaternion(const AdamConstants<S>& constants, const AdamRates
   for (int k = 0; k < 4; ++k) adam_step(constants, rates, gradient[k], n.raw[k], n.moment[k], n.square[k]);
   normalize_quaternion(n.raw, n.value);
 }
+
+template <class S> void refuse_step_gaussians(const char* function, const GaussianAdam<S>& adam);  // as refuse_adam
 
 namespace cpu {
 

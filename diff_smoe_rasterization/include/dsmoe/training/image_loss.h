@@ -93,6 +93,10 @@ template <class S> DSMOE_HD S target_value(const ImageLoss<S>& loss, int64_t ind
 
 template <class S> DSMOE_HD S sign(S value) { return S(value > 0) - S(value < 0); }
 
+// What both backends refuse: null pointers, by name, and sizes that would have them read elsewhere. Throws
+// std::invalid_argument.
+template <class S> void refuse_image_loss(const char* function, const ImageLoss<S>& loss);
+
 namespace cpu {
 
 // How many numbers ImageLoss::sums must have.

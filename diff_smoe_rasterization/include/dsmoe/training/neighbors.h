@@ -15,7 +15,7 @@ template <class S> void mean_squared_distances(const S* points, int64_t count, S
 
 }  // namespace cpu
 
-// On a GPU, points are sorted along a space-filling curve first, so that those of a box of consecutive ones lie
+// On a GPU, points are sorted along a space-filling curve first, so that the points of a box of consecutive ones lie
 // together and whole boxes can be left out.
 namespace cuda {
 
@@ -35,7 +35,7 @@ template <class S> void morton_codes(const MortonCodes<S>& morton, void* stream)
 
 // The mean squared distance of each point to the kNeighbors nearest others, or to as many as there are.
 template <class S> struct NeighborDistances {
-  const S* points;       // [N, 3] in any order, which decides only the speed: that of the Morton curve is good
+  const S* points;       // [N, 3] in any order; only the speed depends on it, and the Morton curve is good
   int64_t count;         // N
   const int64_t* order;  // [N] where the result of each point goes
   S* boxes;              // [ceil(N / kBoxPoints), 2, 3] scratch

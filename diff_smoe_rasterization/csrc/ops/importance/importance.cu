@@ -3,13 +3,13 @@
 // the same bits every time.
 #include <type_traits>
 
-#include "../dispatch.h"
-#include "../refuse.h"
-#include "bands.h"
+#include "cuda/bands.h"
+#include "cuda/exact_sums.cuh"
+#include "cuda/reduce.cuh"
+#include "cuda/segments.cuh"
+#include "dispatch.h"
 #include "dsmoe/passes/importance.h"
-#include "exact_sums.cuh"
-#include "reduce.cuh"
-#include "segments.cuh"
+#include "refuse.h"
 
 namespace dsmoe {
 namespace cuda {

@@ -3,11 +3,68 @@
 
 #include <algorithm>
 
-#include "../refuse_training.h"
+#include "cpu/parallel.h"
 #include "dsmoe/training/gaussians.h"
-#include "parallel.h"
+#include "refuse.h"
 
 namespace dsmoe {
+
+template <class S> void refuse_adam(const char* function, const std::vector<AdamTensor<S>>& tensors) {
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    const AdamTensor<S>& t = tensors[i];
+    refuse_null_fields(
+        function, i, t.size,
+        {{"parameter", t.parameter}, {"gradient", t.gradient}, {"moment", t.moment}, {"square", t.square}});
+    if (t.size > 0 && (t.row_size < 1 || t.size % t.row_size != 0)) {
+      refuse(function, "tensors[", i, "].row_size is ", t.row_size, "; it must be 1 or more and divide ", t.size);
+    }
+  }
+}
+
+template <class S> void refuse_step_gaussians(const char* function, const GaussianAdam<S>& adam) {
+  for (size_t i = 0; i < kGaussianAdamTensors; ++i) {
+    const ActivatedTensor<S>& t = adam.tensors[i];
+    const int64_t size = adam.num_gaussians * t.row_size;
+    refuse_null_fields(function, i, size,
+                       {{"raw", t.raw}, {"dL_dvalue", t.dL_dvalue}, {"moment", t.moment}, {"square", t.square}});
+    if (t.activation != Activation::kNone) refuse_null_fields(function, i, size, {{"value", t.value}});
+  }
+  refuse_null(function, "radii", adam.radii, "[N]", adam.num_gaussians);
+}
+
+static void refuse_num_tensors(const char* function, int num_tensors) {
+  if (0 <= num_tensors && num_tensors <= kLazyAdamMaxTensors) return;
+  refuse(function, "num_tensors is ", num_tensors, "; it must be 0 to ", kLazyAdamMaxTensors);
+}
+
+template <class S> void refuse_catch_up(const char* function, const LazyAdam<S>& adam) {
+  refuse_num_tensors(function, adam.num_tensors);
+  for (int i = 0; i < adam.num_tensors; ++i) {
+    const LazyAdamTensor<S>& t = adam.tensors[i];
+    refuse_null_fields(
+        function, i, adam.num_rows * t.row_size,
+        {{"parameter", t.parameter}, {"moment", t.moment}, {"square", t.square}, {"gradient", t.gradient}});
+  }
+  refuse_null(function, "marks", adam.marks, "[N]", adam.num_rows);
+  refuse_null(function, "rates", adam.rates, "[steps, num_tensors]", adam.num_rows > 0 ? adam.steps : 0);
+}
+
+template <class S> void refuse_note_step(const char* function, const LazyAdamStep<S>& step) {
+  refuse_num_tensors(function, step.num_tensors);
+  refuse_null(function, "marks", step.marks, "[N]", step.num_rows);
+  refuse_null(function, "radii", step.radii, "[N]", step.num_rows);
+  refuse_null(function, "rates", step.rates, "[steps + 1, num_tensors]", step.num_tensors);
+}
+
+template void refuse_adam(const char*, const std::vector<AdamTensor<float>>&);
+template void refuse_adam(const char*, const std::vector<AdamTensor<double>>&);
+template void refuse_step_gaussians(const char*, const GaussianAdam<float>&);
+template void refuse_step_gaussians(const char*, const GaussianAdam<double>&);
+template void refuse_catch_up(const char*, const LazyAdam<float>&);
+template void refuse_catch_up(const char*, const LazyAdam<double>&);
+template void refuse_note_step(const char*, const LazyAdamStep<float>&);
+template void refuse_note_step(const char*, const LazyAdamStep<double>&);
+
 namespace cpu {
 namespace {
 

@@ -7,8 +7,8 @@
 #include <numeric>
 #include <vector>
 
-#include "../refuse.h"
-#include "parallel.h"
+#include "cpu/parallel.h"
+#include "refuse.h"
 
 namespace dsmoe {
 namespace cpu {

@@ -1,7 +1,6 @@
 // Rows by a list, of several tensors in one launch: a block writes a piece of one of them.
-#include "../refuse_training.h"
+#include "cuda/tuning.cuh"
 #include "dsmoe/training/gather.h"
-#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {

@@ -2,8 +2,8 @@
 // that its numbers are read once, and so that its gradients are written once.
 #include <algorithm>
 
-#include "../refuse.h"
-#include "lane_gradient.cuh"
+#include "cuda/lane_gradient.cuh"
+#include "refuse.h"
 
 namespace dsmoe {
 namespace cuda {
@@ -30,7 +30,7 @@ BatchArguments arguments_of(const ViewBatch& batch) {
 }
 
 // All threads of the block take part. No barrier.
-__device__ void load_cameras(const BatchArguments& arguments, Camera<float>* cameras) {
+template <class AnyCamera> __device__ void load_cameras(const BatchArguments& arguments, AnyCamera* cameras) {
   for (int v = 0; v < arguments.num_views; ++v) load_camera(arguments.views[v].camera, cameras[v]);
 }
 
@@ -72,8 +72,9 @@ class RowsOfViews {
   bool has_row_ = false;
 };
 
+template <class AnyCamera>
 __global__ void __launch_bounds__(kViewBlock) count_rows_kernel(const __grid_constant__ BatchArguments arguments) {
-  __shared__ Camera<float> cameras[kMostViews];
+  __shared__ AnyCamera cameras[kMostViews];
   __shared__ int counts[kMostViews];
   const int64_t i = int64_t(blockIdx.x) * kViewBlock + threadIdx.x;
   const bool exists = i < arguments.inputs.num_gaussians;
@@ -120,16 +121,16 @@ __global__ void __launch_bounds__(kSortBlock)
 }
 
 // What the threads of a block share, besides SH rows.
-struct SharedViews {
-  Camera<float> cameras[kMostViews];
+template <class AnyCamera> struct SharedViews {
+  AnyCamera cameras[kMostViews];
   int counts[kMostViews * kViewWarps];
 };
 
 // A thread's Gaussian, with its SH row and where its rows are.
-template <class Rows> class ViewLane {
+template <class AnyCamera, class Rows> class ViewLane {
  public:
   // sh_rows: shared memory. All threads of the block take part, and wait for each other.
-  __device__ ViewLane(const BatchArguments& arguments, SharedViews& shared, float4* sh_rows)
+  __device__ ViewLane(const BatchArguments& arguments, SharedViews<AnyCamera>& shared, float4* sh_rows)
       : i(int64_t(blockIdx.x) * kViewBlock + threadIdx.x),
         length(3 * arguments.inputs.num_sh),
         first(i - threadIdx.x % kWarp),
@@ -152,7 +153,7 @@ template <class Rows> class ViewLane {
     config.leave_out_further_features();
   }
 
-  __device__ ColorSource<float> source(const Camera<float>& camera) const {
+  __device__ ColorSource<float> source(const PinholeCamera<float>& camera) const {
     return {colors(), gaussian.mean, camera, config};
   }
 
@@ -177,11 +178,11 @@ template <class Rows> class ViewLane {
   float dc_[3];        // if degree 0 lies apart
 };
 
-template <class Rows>
+template <class AnyCamera, class Rows>
 __global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_constant__ BatchArguments arguments) {
-  __shared__ SharedViews shared;
+  __shared__ SharedViews<AnyCamera> shared;
   extern __shared__ float4 shared_rows[];
-  const ViewLane<Rows> lane(arguments, shared, shared_rows);
+  const ViewLane<AnyCamera, Rows> lane(arguments, shared, shared_rows);
   for (int v = 0; v < arguments.num_views; ++v) {
     const auto& view = arguments.views[v];
     int32_t radius = lane.of_views.radius(v);
@@ -201,12 +202,12 @@ __global__ void __launch_bounds__(kViewBlock) project_rows_kernel(const __grid_c
   }
 }
 
-template <class Rows>
+template <class AnyCamera, class Rows>
 __global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlocks : 1)
     project_rows_backward_kernel(const __grid_constant__ BatchArguments arguments) {
-  __shared__ SharedViews shared;
+  __shared__ SharedViews<AnyCamera> shared;
   extern __shared__ float4 shared_rows[];
-  const ViewLane<Rows> lane(arguments, shared, shared_rows);
+  const ViewLane<AnyCamera, Rows> lane(arguments, shared, shared_rows);
   const GaussianGradients<float>& gradients = arguments.gradients;
   ViewSum<Rows::kKnown ? Rows::kLength : kAllShLength> sum;
   for (int v = 0; v < arguments.num_views; ++v) {
@@ -220,7 +221,7 @@ __global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlock
     for (int k = 0; k < kNumGateGradients + kFastFeatures; ++k) {
       record[k] = view.records[row * (kNumGateGradients + kFastFeatures) + k];
     }
-    const auto by_view = sum.add(lane.gaussian, lane.source(shared.cameras[v]), features, record);
+    const auto by_view = sum.add(lane.gaussian, lane.source(shared.cameras[v]), shared.cameras[v], features, record);
     if (view.means2D != nullptr) store3<float>(view.means2D + 3 * lane.i, {by_view.mean2D.x, by_view.mean2D.y, 0});
   }
   __syncwarp();
@@ -241,9 +242,18 @@ __global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlock
   }
 }
 
+template <class Body> void dispatch_cameras(const ViewBatch& batch, const Body& body) {
+  dispatch_camera<float>(
+      std::any_of(batch.views.begin(), batch.views.end(), [](const auto& view) { return has_lens(view.camera); }),
+      body);
+}
+
+// Calls launch(TypeOf<camera>, TypeOf<rows>, blocks, bytes of shared memory).
 template <class Launch> void launch_rows(const ViewBatch& batch, bool aligned, const Launch& launch) {
-  dispatch_sh_rows(batch.inputs, aligned, [&](auto type, size_t shared) {
-    launch(type, static_cast<unsigned>(num_view_blocks(batch.inputs.num_gaussians)), shared);
+  dispatch_cameras(batch, [&](auto camera) {
+    dispatch_sh_rows(batch.inputs, aligned, [&](auto rows, size_t shared) {
+      launch(camera, rows, static_cast<unsigned>(num_view_blocks(batch.inputs.num_gaussians)), shared);
+    });
   });
 }
 
@@ -254,8 +264,11 @@ void count_rows(const ViewBatch& batch, const Work& work) {
   const BatchArguments arguments = arguments_of(batch);
   const int64_t blocks = num_view_blocks(batch.inputs.num_gaussians);
   if (blocks > 0) {
-    count_rows_kernel<<<static_cast<unsigned>(blocks), kViewBlock, 0, work.stream>>>(arguments);
-    DSMOE_CHECK_LAUNCH("count_rows");
+    dispatch_cameras(batch, [&](auto camera) {
+      using AnyCamera = typename decltype(camera)::type;
+      count_rows_kernel<AnyCamera><<<static_cast<unsigned>(blocks), kViewBlock, 0, work.stream>>>(arguments);
+      DSMOE_CHECK_LAUNCH("count_rows");
+    });
   }
   add_up_rows_kernel<<<arguments.num_views, kSortBlock, 0, work.stream>>>(arguments, blocks);
   DSMOE_CHECK_LAUNCH("add_up_rows");
@@ -265,8 +278,10 @@ void project_rows(const ViewBatch& batch, const Work& work) {
   refuse_rows<Frame<float>>("cuda::project_rows", batch, false);
   if (batch.inputs.num_gaussians == 0) return;
   const BatchArguments arguments = arguments_of(batch);
-  launch_rows(batch, true, [&](auto type, unsigned blocks, size_t shared) {
-    project_rows_kernel<typename decltype(type)::type><<<blocks, kViewBlock, shared, work.stream>>>(arguments);
+  launch_rows(batch, true, [&](auto camera, auto rows, unsigned blocks, size_t shared) {
+    using AnyCamera = typename decltype(camera)::type;
+    using Rows = typename decltype(rows)::type;
+    project_rows_kernel<AnyCamera, Rows><<<blocks, kViewBlock, shared, work.stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("project_rows");
   });
 }
@@ -278,9 +293,10 @@ void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float
   arguments.gradients = gradients;
   const bool aligned =
       are_vector_aligned(gradients.shs, gradients.dc, gradients.means3D, gradients.scales, gradients.rotations);
-  launch_rows(batch, aligned, [&](auto type, unsigned blocks, size_t shared) {
-    using Rows = typename decltype(type)::type;
-    project_rows_backward_kernel<Rows><<<blocks, kViewBlock, shared, work.stream>>>(arguments);
+  launch_rows(batch, aligned, [&](auto camera, auto rows, unsigned blocks, size_t shared) {
+    using AnyCamera = typename decltype(camera)::type;
+    using Rows = typename decltype(rows)::type;
+    project_rows_backward_kernel<AnyCamera, Rows><<<blocks, kViewBlock, shared, work.stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("project_rows_backward");
   });
 }

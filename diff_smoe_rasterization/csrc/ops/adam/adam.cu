@@ -1,10 +1,9 @@
 // Adam over several tensors in one launch: a block takes a piece of one of them.
 #include <algorithm>
 
-#include "../refuse_training.h"
+#include "cuda/tuning.cuh"
 #include "dsmoe/training/adam.h"
 #include "dsmoe/training/gaussians.h"
-#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {

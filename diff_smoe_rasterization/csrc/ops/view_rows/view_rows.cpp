@@ -3,10 +3,10 @@
 #include <algorithm>
 #include <cstring>
 
-#include "../refuse.h"
+#include "cpu/parallel.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
-#include "parallel.h"
+#include "refuse.h"
 
 namespace dsmoe {
 namespace cpu {
@@ -81,7 +81,7 @@ void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float
         if (view.radii[i] == 0) continue;
         const int64_t row = rows[v]++;
         if (view.radii[i] < 0) continue;
-        const auto own = sum.add(gaussian, {colors, gaussian.mean, view.camera, batch.config},
+        const auto own = sum.add(gaussian, {colors, gaussian.mean, view.camera, batch.config}, view.camera,
                                  view.features + row * kRowFeatures, view.records + row * (kNumGateGradients + 3));
         if (view.means2D != nullptr) store3<float>(view.means2D + 3 * i, {own.mean2D.x, own.mean2D.y, 0});
       }

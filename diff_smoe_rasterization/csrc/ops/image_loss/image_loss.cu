@@ -1,8 +1,7 @@
 // L1, squares and SSIM. One kernel computes the values, and SSIM's derivatives by the local moments; one the gradient;
 // one adds up. A block computes one tile of one plane. Windows run along rows, then along columns, in shared memory.
-#include "../refuse_training.h"
+#include "cuda/tuning.cuh"
 #include "dsmoe/training/image_loss.h"
-#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {

@@ -3,10 +3,24 @@
 
 #include <algorithm>
 
-#include "../refuse_training.h"
-#include "parallel.h"
+#include "cpu/parallel.h"
+#include "refuse.h"
 
 namespace dsmoe {
+
+template <class S>
+void refuse_gather(const char* function, const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows) {
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    const int64_t size = rows.count * tensors[i].row_size;
+    refuse_null_fields(function, i, size, {{"to", tensors[i].to}});
+    if (tensors[i].from == nullptr && size > 0) refuse(function, "tensors[", i, "].from is null; it must have rows");
+  }
+  refuse_null(function, "rows", rows.rows, "[count]", tensors.empty() ? 0 : rows.count);
+}
+
+template void refuse_gather(const char*, const std::vector<GatherTensor<float>>&, const GatherRows&);
+template void refuse_gather(const char*, const std::vector<GatherTensor<double>>&, const GatherRows&);
+
 namespace cpu {
 namespace {
 

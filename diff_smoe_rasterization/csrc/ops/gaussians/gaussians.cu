@@ -1,6 +1,6 @@
 // Passes over all Gaussians, or over what else there are many of: a thread each.
+#include "cuda/tuning.cuh"
 #include "dsmoe/training/gaussians.h"
-#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {

@@ -1,10 +1,10 @@
 // The three nearest neighbours of every point: exact, by leaving out boxes that are too far.
 #include <cmath>
 
-#include "../refuse.h"
+#include "cuda/tuning.cuh"
 #include "dsmoe/hd.h"
 #include "dsmoe/training/neighbors.h"
-#include "tuning.cuh"
+#include "refuse.h"
 
 namespace dsmoe {
 namespace cuda {

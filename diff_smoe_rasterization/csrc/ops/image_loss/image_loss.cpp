@@ -5,10 +5,26 @@
 #include <algorithm>
 #include <vector>
 
-#include "../refuse_training.h"
-#include "parallel.h"
+#include "cpu/parallel.h"
+#include "refuse.h"
 
 namespace dsmoe {
+
+template <class S> void refuse_image_loss(const char* function, const ImageLoss<S>& loss) {
+  const int64_t size = loss.planes * loss.height * loss.width;
+  refuse_null(function, "image", loss.image, "[planes, height, width]", size);
+  if (loss.target == nullptr && loss.target_bytes == nullptr && size > 0) {
+    refuse(function, "target and target_bytes are null; one must point to an array [planes, height, width]");
+  }
+  refuse_null(function, "loss", loss.loss, "[1]", 1);
+  refuse_null(function, "sums", loss.sums, "[num_image_loss_sums(...)]", size);
+  refuse_null(function, "derivatives", loss.derivatives, "[3, planes, height, width], as a gradient is wanted",
+              loss.gradient != nullptr ? size : 0);
+}
+
+template void refuse_image_loss(const char*, const ImageLoss<float>&);
+template void refuse_image_loss(const char*, const ImageLoss<double>&);
+
 namespace cpu {
 namespace {
 

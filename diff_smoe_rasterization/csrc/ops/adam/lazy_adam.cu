@@ -2,9 +2,8 @@
 // them.
 #include <algorithm>
 
-#include "../refuse_training.h"
+#include "cuda/tuning.cuh"
 #include "dsmoe/training/adam.h"
-#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {

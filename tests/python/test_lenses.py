@@ -1,0 +1,307 @@
+"""Cameras that are no pinholes: against the reference, against brute force through exact lenses, and refusals."""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from comparison import assert_all_close, assert_close, one_thread, reference_gradients, threshold_margin
+from devices import on_the_cpu, random_normal
+from scenes import assert_not_empty, camera_settings, gradients, op_arguments, random_scene
+
+from diff_smoe_rasterization import (
+    GaussianRasterizer,
+    blend_footprints,
+    project_gaussians,
+    rasterize,
+    reference,
+    settings_from_camera,
+)
+from diff_smoe_rasterization.settings import BLEND_MODES, CAMERA_MODELS, OUTPUTS
+from dsmoe.distributed.rows import ViewRows
+
+pytestmark = pytest.mark.usefixtures("device")
+
+OF_OPENCV = (-0.2, 0.05, 0.01, -0.02, 0.03, 0.01, 0.02, -0.01, 0.01, -0.005, 0.004, 0.003)
+LENSES = {
+    "orthographic": dict(camera_model="orthographic", tanfovx=2.0, tanfovy=1.5, principal_point=(26.0, 17.5)),
+    "opencv": dict(camera_model="opencv", distortion=OF_OPENCV, principal_point=(26.0, 17.5)),
+    "fisheye": dict(camera_model="fisheye", distortion=(0.02, -0.01, 0.003, -0.0002), tanfovx=1.25, tanfovy=0.875),
+    "thin_prism_fisheye": dict(camera_model="thin_prism_fisheye", tanfovx=1.25, tanfovy=0.875,
+                               distortion=(0.02, -0.01, 0.003, -0.002, 0.01, 0.001, 0.02, -0.01)),
+    "equirectangular": dict(camera_model="equirectangular"),
+}
+"""Fields of the settings, one of every model."""
+every_lens = pytest.mark.parametrize("lens", LENSES)
+FLOAT64_TOLERANCE = 1e-12  # as in test_against_reference.py, for the same reasons, as is the next
+FLOAT32_MARGIN = 1e-3
+
+
+def lens_scene(mode, lens, covariance="scales", **options):
+    """A scene, around the camera if its lens sees around. Two Gaussians are on its axis, where a series begins."""
+    position = (0.4, -0.3, -4.0) if lens in ("orthographic", "opencv") else (0.4, -0.3, -1.5)
+    scene = random_scene(mode, 70, 40, 30, covariance=covariance, degree=1, position=position)
+    means3D = scene.inputs["means3D"].clone()
+    for row, share in enumerate((0.5, 1.2)):
+        means3D[-1 - row] = scene.settings.campos * (1 - share)
+    return scene.with_inputs(means3D=means3D).with_settings(**{"near": 0.5, **options, **LENSES[lens]})
+
+
+@every_lens
+@pytest.mark.parametrize("covariance", ["scales", "cov3D"])
+@pytest.mark.parametrize("mode", BLEND_MODES)
+def test_float64(mode, covariance, lens):
+    scene = lens_scene(mode, lens, covariance).with_settings(antialiasing=True)
+    expected, expected_gradients = reference_gradients(scene, OUTPUTS)
+    assert_not_empty(expected, scene.settings)
+    rendering, found = gradients(rasterize, scene, OUTPUTS)
+    assert torch.equal(rendering.radii.cpu(), expected.radii)
+    for name in ("color", *OUTPUTS):
+        assert_close(getattr(rendering, name), getattr(expected, name), FLOAT64_TOLERANCE, name)
+    assert_all_close(found, expected_gradients, FLOAT64_TOLERANCE)
+    assert not found["projmatrix"].any(), "all of the pose is in viewmatrix"
+
+
+@every_lens
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_float32(mode, lens):
+    scene = lens_scene(mode, lens, near=1.0)
+    safe = threshold_margin(scene) > FLOAT32_MARGIN
+    assert safe.double().mean() > 0.8
+    weights = random_normal((3, 30, 40), 1).cpu() * safe
+
+    def masked(function, scene):
+        scene = scene.requiring_grad()
+        color = function(settings=scene.settings, **scene.inputs).color
+        leaves = scene.leaves()
+        values = torch.autograd.grad(color, list(leaves.values()), weights.to(color), allow_unused=True)
+        return color.detach().cpu(), {name: torch.zeros_like(leaf).cpu() if value is None else value.cpu()
+                                      for (name, leaf), value in zip(leaves.items(), values)}
+
+    with one_thread(), on_the_cpu():
+        expected, expected_gradients = masked(reference.rasterize, scene.to("cpu"))
+    color, found = masked(rasterize, scene.to(torch.float32))
+    assert_close(color[:, safe], expected[:, safe], 1e-5, "color")
+    assert_all_close(found, expected_gradients, 1e-4)  # as in test_against_reference.py
+
+
+def test_a_lens_without_distortion_is_the_pinhole():
+    """Up to the epsilon that 3DGS adds to the clip w, 1e-7: also where the slopes of the Jacobian are clamped."""
+    scene = random_scene("smoe", 200, degree=1)
+    pinhole, expected = gradients(rasterize, scene, OUTPUTS)
+    rendering, found = gradients(rasterize, scene.with_settings(camera_model="opencv"), OUTPUTS)
+    assert torch.equal(rendering.radii, pinhole.radii)
+    for name in ("color", *OUTPUTS):
+        assert_close(getattr(rendering, name), getattr(pinhole, name), 1e-6, name)
+    del found["viewmatrix"], found["projmatrix"], expected["viewmatrix"], expected["projmatrix"]
+    assert_all_close(found, expected, 1e-6)
+
+
+def exact_lens(model, distortion, view, focal):
+    """Pixels of points in view space [n, 3] before the principal point, by numpy and from the models' definitions."""
+    x, y, z = view.T
+    k = list(distortion)
+    if model == "orthographic":
+        u, v = x, y
+    elif model == "opencv":
+        k1, k2, p1, p2 = k
+        a, b = x / z, y / z
+        r2 = a * a + b * b
+        scale = 1 + k1 * r2 + k2 * r2 * r2
+        u = a * scale + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+        v = b * scale + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    elif model == "equirectangular":
+        u, v = np.arctan2(x, z), np.arcsin(y / np.sqrt(x * x + y * y + z * z))
+    else:
+        rho = np.hypot(x, y)
+        theta = np.arccos(z / np.sqrt(x * x + y * y + z * z))
+        u, v = theta * x / rho, theta * y / rho
+        k1, k2, p1, p2, k3, k4, sx1, sy1 = k if model == "thin_prism_fisheye" else [*k[:2], 0, 0, *k[2:], 0, 0]
+        r2 = theta * theta
+        scale = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+        u, v = (u * scale + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + sx1 * r2,
+                v * scale + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + sy1 * r2)
+    return np.stack([u, v], 1) * focal
+
+
+# The angle to the axis in degrees; of "equirectangular" along the horizon, and a latitude of 50 degrees.
+PLACES = [("orthographic", (), 30.0), ("opencv", (-0.25, 0.06, 0.001, -0.002), 5.0),
+          ("opencv", (-0.25, 0.06, 0.001, -0.002), 35.0), ("opencv", (0.08, 0.01, 0.001, 0.002), 30.0),
+          ("fisheye", (0.02, -0.008, 0.002, -0.0003), 5.0), ("fisheye", (0.02, -0.008, 0.002, -0.0003), 40.0),
+          ("fisheye", (0.02, -0.008, 0.002, -0.0003), 80.0), ("fisheye", (0.02, -0.008, 0.002, -0.0003), 95.0),
+          ("thin_prism_fisheye", (0.02, -0.008, 0.001, 0.002, 0.002, -0.0003, 0.004, -0.003), 80.0),
+          ("equirectangular", (), 120.0), ("equirectangular", (), -50.0)]
+
+
+@pytest.mark.parametrize("model, distortion, angle", PLACES)
+def test_footprints_are_those_of_brute_force(model, distortion, angle):
+    """Moments of Gaussians through the exact lens, by 9 x 9 x 9 nodes of Gauss and Hermite, at a focal length of 300.
+
+    Gaussians 4:2:1 with the short axis along the ray. Where sigma is below 12 px the centre is within 2.5 % of sigma
+    and the covariance within 1 %; below 40 px 7 % and 5 %, what the affine approximation of a pinhole leaves too.
+    """
+    focal, count = 300.0, 24
+    generator = np.random.default_rng(5)
+    turn = math.radians(abs(angle))
+    side = generator.uniform(0, 2 * math.pi, count)
+    if model == "equirectangular":
+        side = np.full(count, 0.0 if angle > 0 else -0.5 * math.pi)
+    ray = np.stack([math.sin(turn) * np.cos(side), math.sin(turn) * np.sin(side), np.full(count, math.cos(turn))], 1)
+    depth = generator.uniform(3, 6, count)[:, None]
+    means = depth * ray
+    across = np.cross(ray, generator.normal(size=(count, 3)))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    longest = np.geomspace(2, 38, count)[:, None] / focal * (1.0 if model == "orthographic" else depth)
+    axes = longest[:, :, None] * np.stack([across, 0.5 * np.cross(ray, across), 0.25 * ray], 2)
+
+    size = 4000
+    K = None if model == "equirectangular" else [[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]
+    width, height = (round(2 * math.pi * focal), round(math.pi * focal)) if K is None else (size, size)
+    settings = settings_from_camera(K, torch.eye(3), torch.zeros(3), width, height, dtype=torch.float64,
+                                    camera_model=model, distortion=distortion, low_pass=0.0,
+                                    bg=torch.zeros(1, dtype=torch.float64))
+
+    def tensor(array):
+        return torch.as_tensor(array, dtype=torch.float64, device=settings.bg.device)
+
+    full = (axes @ axes.transpose(0, 2, 1))[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+    prints = project_gaussians(tensor(means), tensor(np.full(count, 0.5)), settings, cov3D_precomp=tensor(full),
+                               colors_precomp=tensor(np.ones((count, 1))))
+    assert (prints.radii > 0).all()
+    centres = prints.means2D.cpu().numpy() + 0.5 - np.array([width, height]) / 2
+    xx, xy, yy = prints.conics.cpu().numpy().T
+    covariances = np.linalg.inv(np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2))
+
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    grid = np.stack(np.meshgrid(nodes, nodes, nodes), -1).reshape(-1, 3)
+    weight = np.prod(np.meshgrid(weights, weights, weights), 0).reshape(-1) / (2 * math.pi) ** 1.5
+    scale = np.array([width / (2 * math.pi), height / math.pi]) if K is None else focal
+    sigmas = []
+    for i in range(count):
+        points = exact_lens(model, distortion, means[i] + grid @ axes[i].T, scale)
+        mean = weight @ points
+        covariance = (points - mean).T @ ((points - mean) * weight[:, None])
+        sigma = math.sqrt(np.linalg.eigvalsh(covariance)[-1])
+        off_centre = np.linalg.norm(mean - centres[i]) / sigma
+        off_shape = np.linalg.norm(covariance - covariances[i]) / np.linalg.norm(covariance)
+        most = (0.025, 0.01) if sigma < 12 else (0.07, 0.05)
+        assert sigma > 40 or (off_centre < most[0] and off_shape < most[1]), (sigma, off_centre, off_shape)
+        sigmas.append(sigma)
+    assert min(sigmas) < 6 and max(sigmas) > 20
+
+
+@pytest.mark.parametrize("model, distortion, angle", [("opencv", (-0.3,), 55.0), ("fisheye", (-0.2,), 80.0),
+                                                      ("fisheye", (), 176.0)])
+def test_beyond_its_range_a_lens_sees_nothing(model, distortion, angle):
+    """r (1 - 0.3 r^2) rises to r = 1.05, theta (1 - 0.2 theta^2) to 74 degrees. Folded back, they would be seen."""
+    settings = settings_from_camera([[20, 0, 30], [0, 20, 30], [0, 0, 1]], torch.eye(3), torch.zeros(3), 60, 60,
+                                    camera_model=model, distortion=distortion)
+    turn = math.radians(angle)
+    means3D = torch.tensor([[math.sin(turn), 0.0, math.cos(turn)], [0.1, 0.1, 1.0]], requires_grad=True)
+    rendering = rasterize(means3D, torch.full((2,), 0.9), settings, scales=torch.full((2, 3), 0.05),
+                          rotations=torch.tensor([[1.0, 0, 0, 0]] * 2), colors_precomp=torch.ones(2, 3))
+    assert rendering.radii[0] == 0 and rendering.radii[1] > 0
+    rendering.color.sum().backward()
+    assert not means3D.grad[0].any() and means3D.grad[1].any()
+
+
+def test_a_fisheye_sees_beside_and_behind_itself():
+    """Depths are distances: 2 on the right and 2.5 at 120 degrees, behind the camera."""
+    settings = settings_from_camera([[20, 0, 50], [0, 20, 50], [0, 0, 1]], torch.eye(3), torch.zeros(3), 100, 100,
+                                    camera_model="fisheye")
+    turn = math.radians(120)
+    means3D = torch.tensor([[2.0, 0, 0], [0, 2.5 * math.sin(turn), 2.5 * math.cos(turn)], [0, 0, -2.0]])
+    prints = project_gaussians(means3D, torch.full((3,), 0.9), settings, scales=torch.full((3, 3), 0.05),
+                               rotations=torch.tensor([[1.0, 0, 0, 0]] * 3), colors_precomp=torch.ones(3, 3))
+    assert (prints.radii > 0).tolist() == [True, True, False]
+    expected = torch.tensor([[49.5 + 20 * math.pi / 2, 49.5], [49.5, 49.5 + 20 * turn]])
+    assert torch.allclose(prints.means2D[:2], expected, atol=1e-4)
+    assert torch.allclose(prints.depths[:2], torch.tensor([2.0, 2.5]))
+    assert GaussianRasterizer(settings).markVisible(means3D).all()
+    near = settings._replace(near=2.2)
+    assert GaussianRasterizer(near).markVisible(means3D).tolist() == [False, True, False]
+
+
+@every_lens
+def test_both_halves_of_a_rendering(lens):
+    scene = lens_scene("smoe", lens).to(torch.float32)
+
+    def in_halves(*, settings, outputs=(), **inputs):
+        return blend_footprints(project_gaussians(settings=settings, outputs=outputs, **inputs), settings, outputs)
+
+    expected, whole = gradients(rasterize, scene, OUTPUTS)
+    rendering, halves = gradients(in_halves, scene, OUTPUTS)
+    assert torch.equal(rendering.color, expected.color) and torch.equal(rendering.radii, expected.radii)
+    assert_all_close(halves, whole, 1e-5)  # sums over tiles are rounded once more
+
+
+def test_footprints_across_the_seam_are_drawn_on_both_sides():
+    """As if the camera looked elsewhere: a turn of 180 degrees moves the image by half its width."""
+    width, height = 64, 32
+    scene = lens_scene("smoe", "equirectangular").to(torch.float32)
+    turned = scene.settings.viewmatrix.clone()
+    turned[:, (0, 2)] *= -1
+    images = []
+    for view in (scene.settings.viewmatrix, turned):
+        settings = scene.settings._replace(viewmatrix=view, image_width=width, image_height=height)
+        prints = project_gaussians(settings=settings, **scene.inputs)
+        whole = prints.around(width)
+        assert len(whole.radii) > len(prints.radii) == len(scene.inputs["means3D"])
+        images.append([blend_footprints(each, settings).color for each in (whole, prints)])
+    assert_close(images[1][0].roll(width // 2, 2), images[0][0], 1e-3, "color")  # beyond 3 sigma little is left
+    assert (images[1][1].roll(width // 2, 2) - images[0][1]).abs().max() > 0.05, "a seam without the copies"
+
+
+def test_a_batch_takes_views_of_different_models():
+    scene = lens_scene("smoe", "fisheye").to(torch.float32)
+    views = [scene.settings] + [scene.settings._replace(**{"distortion": (), "principal_point": None, **lens})
+                                for lens in (dict(camera_model="pinhole"), LENSES["opencv"])]
+    inputs = {name: tensor for name, tensor in scene.inputs.items() if name != "means2D"}
+    rows = ViewRows(views, **inputs)
+    rows.project(rows.counts.tolist(), range(len(views)))
+    for settings, radii in zip(views, rows.radii):
+        expected = rasterize(settings=settings, **inputs).radii
+        assert (expected > 0).any() and torch.equal(radii, expected)
+
+
+def test_opcheck():
+    scene = lens_scene("smoe", "fisheye").to(torch.float32).requiring_grad()
+    if not hasattr(torch.library, "opcheck"):
+        pytest.skip("torch before 2.4 has no opcheck")
+    torch.library.opcheck(torch.ops.diff_smoe_rasterization.project.default, op_arguments(scene, "project"),
+                          test_utils=("test_schema", "test_faketensor"))
+
+
+FISHEYE = dict(camera_model="fisheye")
+
+
+@pytest.mark.parametrize("fields, message", [
+    (dict(camera_model="fish"), f"camera_model is 'fish'; it must be one of {', '.join(CAMERA_MODELS)}"),
+    (dict(distortion=(0.1,)), r"distortion is \(0.1,\), but camera_model is 'pinhole'; name the lens that has it"),
+    (dict(principal_point=(3.0, 4.0)), "principal_point is .*'pinhole'; its principal point is in projmatrix"),
+    (dict(distortion=(0.1, 0.2, 0.3), **FISHEYE), "distortion has 3 numbers; it must have 0, 1, 2 or 4: k1 k2 k3 k4"),
+    (dict(distortion=(0.1, math.nan), **FISHEYE), r"distortion\[1\] is nan; it must be finite"),
+    (dict(distortion=("a",), **FISHEYE), r"distortion is \('a',\); it must be a sequence of numbers"),
+    (dict(principal_point=(3.0,), **FISHEYE), r"principal_point is \(3.0,\); it must be two numbers"),
+    (dict(principal_point=(3.0, math.inf), **FISHEYE), "principal_point is 3, inf; it must be finite"),
+    (dict(distortion=(-1e7,), **FISHEYE), "distortion folds the image back at .* pixels from the principal point"),
+    (dict(distortion=(0.1,), camera_model="equirectangular"), "distortion has 1 numbers; it must have 0")])
+def test_bad_lenses_are_named(fields, message):
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
+    with pytest.raises(ValueError, match=message):
+        rasterize(settings=scene.settings._replace(**fields), **scene.inputs)
+
+
+def test_settings_from_camera_of_a_lens():
+    K, R, t = [[30, 0, 21], [0, 33, 14], [0, 0, 1]], torch.eye(3), torch.tensor([0.0, 0, 4])
+    settings = settings_from_camera(K, R, t, 40, 30, camera_model="fisheye", distortion=[0.1, 0.01])
+    assert settings.principal_point == (21, 14) and settings.distortion == (0.1, 0.01)
+    assert 40 / (2 * settings.tanfovx) == pytest.approx(30) and 30 / (2 * settings.tanfovy) == pytest.approx(33)
+    around = settings_from_camera(None, R, t, 40, 30, camera_model="equirectangular")
+    assert around.camera_model == "equirectangular"
+    with pytest.raises(ValueError, match="K is given; an equirectangular camera has none"):
+        settings_from_camera(K, R, t, 40, 30, camera_model="equirectangular")
+    with pytest.raises(ValueError, match="camera_model is 'kannala'; it must be one of"):
+        settings_from_camera(K, R, t, 40, 30, camera_model="kannala")
+    assert camera_settings(40, 30).camera_model == "pinhole"
