@@ -197,6 +197,8 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         "train|nowhere|-o|o": "scene nowhere: no such folder", f"train|{ply}|-o|o": "is a file; a scene is a folder",
         f"train|{scene}|-o|o|--iterations|0": "--iterations is 0; it must be at least 1",
         f"train|{scene}|-o|o|--paper|--background-gate|1": "with --paper it is 0.0, or left out",
+        f"train|{scene}|-o|o|--init|nowhere": "nowhere: no such file or folder; name a .ply, .splat",
+        "simplify|nowhere|-o|o|--budget|9": "nowhere: no such file or folder; name a .ply, .splat",
         "scene|nowhere|-o|o": "no such folder of photographs", "eval|nowhere": "nowhere: no such folder",
         f"eval|{tmp_path}": "holds no config.json", "render|nowhere|-o|o": "no such file or folder",
         f"render|{ply}|-o|o": "a .ply holds no cameras", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
