@@ -47,8 +47,9 @@ def test_float32_is_near_the_cpu(mode, name, gpu):
     actual = importance_of(scene, gpu, torch.float32, maps)
     for field, values, other in zip(Importance._fields, actual, expected):
         # Positions rounded by 3e-5 px change the alpha of the smallest splats by 2e-4 of itself, and a cost goes with
-        # its square; a pair within rounding of a threshold may count on one side only.
-        assert_close(values, other, 2e-3, field)
+        # its square; a pair within rounding of a threshold may count on one side only. A lens with angles rounds more:
+        # CUDA's atan2f errs by up to 3 units in the last place, a division by half of one.
+        assert_close(values, other, 6e-3 if name == "lens_equirectangular" else 2e-3, field)
 
 
 @with_gate
