@@ -63,7 +63,7 @@ def fields_of(struct):
     """The names of the fields of a struct of dsmoe/torch.h, in order."""
     text = (ROOT / "diff_smoe_rasterization" / "include" / "dsmoe" / "torch.h").read_text()
     body = text.partition(f"struct {struct} {{\n")[2].partition("\n};")[0]
-    return re.findall(r"^  [\w:<>]+ (\w+)(?: = [^;]*)?;", body, re.MULTILINE)
+    return re.findall(r"^  [\w:<>, ]+ (\w+)(?: = [^;]*)?;", body, re.MULTILINE)
 
 
 def test_cpp_has_pythons_names():
