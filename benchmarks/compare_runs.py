@@ -13,8 +13,8 @@ from typing import Optional, Sequence
 import torch
 from PIL import Image
 
-from dsmoe.config import TrainConfig
 from dsmoe.inspection import open_run, to_image
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.metrics import psnr, quantised
 from dsmoe.results.pictures import comparison
 from dsmoe.scenes.scene import load_scene

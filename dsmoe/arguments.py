@@ -8,13 +8,13 @@ from typing import Any, Iterator, List, Tuple
 from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.settings import BLEND_MODES, PAPER_PROGRAM
 
-from . import choices
 from .bench.names import SCENES, SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
-from .config import PRINCIPAL_POINTS, TrainConfig
-from .config_arguments import add_arguments, number, whole_number
+from .options import choices
+from .options.config import PRINCIPAL_POINTS, TrainConfig
+from .options.config_arguments import add_arguments, number, whole_number
+from .options.presets import BEST, FAST
 from .patches import TRAINERS
-from .presets import BEST, FAST
 
 TRAIN_EXAMPLES = """examples:
   dsmoe train garden -o garden_model                              as many Gaussians as the scene needs

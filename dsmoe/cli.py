@@ -9,12 +9,12 @@ import sys
 from typing import TYPE_CHECKING, Any, Dict, List, Optional
 
 from .arguments import build_parser, completion_script
-from .config import CHECKPOINT_NAME, TrainConfig, holds_run
-from .config_arguments import config_from_arguments, given_options, take_paper
-from .early import check_early
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
+from .options.config import CHECKPOINT_NAME, TrainConfig, holds_run
+from .options.config_arguments import config_from_arguments, given_options, take_paper
+from .options.early import check_early
+from .options.presets import STRATEGY
 from .patches import PatchError
-from .presets import STRATEGY
 from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
 from .system.process import command
@@ -288,8 +288,8 @@ def _start_from(arguments: argparse.Namespace) -> None:
 
 
 def _scene(arguments: argparse.Namespace) -> None:
+    from .options.short_run import train_command
     from .photos import make_scene
-    from .short_run import train_command
     from .system.device import device_to_train_on
 
     device = device_to_train_on()

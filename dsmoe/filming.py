@@ -6,10 +6,10 @@ from typing import Iterator, Sequence
 import torch
 from PIL import Image
 
-from .choices import ORBIT_FRAMES, VIDEO_FPS
-from .early import check_orbit
 from .errors import TrainerError
 from .inspection import Trained, said_of_images, to_image, write_images
+from .options.choices import ORBIT_FRAMES, VIDEO_FPS
+from .options.early import check_orbit
 from .results.video import check_folder, check_video, is_video, write_video
 from .scenes.cameras import Camera
 from .system.progress import progress_bar

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from .config import CHECKPOINT_NAME, LEARNED, TrainConfig
-from .early import check_source
 from .errors import TrainerError, printable
 from .model import GaussianModel
+from .options.config import CHECKPOINT_NAME, LEARNED, TrainConfig
+from .options.early import check_source
 from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, model_path

@@ -9,8 +9,8 @@ import torch
 from diff_smoe_rasterization.lazy_adam import LazyAdam
 from diff_smoe_rasterization.optimizers import FusedAdam
 
-from .config import TrainConfig
 from .model import PARAMETERS, GaussianModel
+from .options.config import TrainConfig
 from .system.process import return_spare_memory
 
 ADAM_EPSILON = 1e-15

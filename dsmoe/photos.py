@@ -13,9 +13,9 @@ import urllib.parse
 from dataclasses import dataclass
 from typing import Any, Callable, List, Optional, Sequence, Tuple
 
-from .choices import CAMERA_MODEL, MATCHING, MOST_EXHAUSTIVE
-from .early import FROM_VIDEO, VIDEO_ENDINGS, check_photos
 from .errors import SceneError, TrainerError, printable
+from .options.choices import CAMERA_MODEL, MATCHING, MOST_EXHAUSTIVE
+from .options.early import FROM_VIDEO, VIDEO_ENDINGS, check_photos
 from .scenes.images import UNREADABLE, image_size, open_image
 from .system.files import is_file, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record

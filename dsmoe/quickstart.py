@@ -14,11 +14,12 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from .config import IMAGES, TrainConfig, flags_text
 from .errors import TrainerError, in_one_line, print_any_name
 from .inspection import open_renderer, to_image
-from .presets import FAST, STRATEGY, chosen_for_scene, with_preset
-from .quickstart_options import DEFAULT_FOLDER, MODES, config_of, given_options, parse, unchecked_config
+from .options.config import IMAGES, TrainConfig, flags_text
+from .options.presets import FAST, STRATEGY, chosen_for_scene, with_preset
+from .options.quickstart_options import DEFAULT_FOLDER, MODES, config_of, given_options, parse, unchecked_config
+from .options.short_run import smaller_images
 from .results.metrics import psnr, quantised
 from .results.modelfile import model_path
 from .results.pictures import comparison, evenly_spaced, file_names
@@ -26,7 +27,6 @@ from .results.rows import RESULTS_NAME, blend_name, results_table, viewer_warnin
 from .scenes.images import View, image_size
 from .scenes.scene import Scene, load_scene, read_layout
 from .scenes.synthetic import write_synthetic_scene
-from .short_run import smaller_images
 from .system.device import chosen_device, device_line
 from .system.interrupt import exit_status
 from .system.output_folder import Record, make_folder, only_one, own_record, read_record, remove_files, write_record

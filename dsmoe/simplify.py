@@ -5,10 +5,10 @@ import dataclasses
 import os
 from typing import Any, Callable, Dict, List, NamedTuple, Optional
 
-from .choices import SIMPLIFY_ITERATIONS
-from .config import TrainConfig, holds_run
 from .errors import ConfigError, TrainerError
 from .inspection import open_renderer
+from .options.choices import SIMPLIFY_ITERATIONS
+from .options.config import TrainConfig, holds_run
 from .results.evaluation import Evaluation, evaluate
 from .results.modelfile import model_path
 from .results.rendering import Renderer

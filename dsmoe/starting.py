@@ -14,13 +14,13 @@ import torch
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES
 
-from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of
-from .early import check_model
 from .errors import ConfigError, TrainerError
 from .export.glb import glb_gaussians
 from .export.splat import splat_gaussians
 from .export.spz import spz_gaussians
 from .model import GaussianModel, finite_rows
+from .options.config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of
+from .options.early import check_model
 from .results.evaluation import evaluate
 from .results.modelfile import (
     Recorded,

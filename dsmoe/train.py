@@ -7,9 +7,9 @@ import os
 import re
 from typing import IO, Any, Callable, Dict, List, Optional, Tuple
 
-from .config import CHECKPOINT_NAME, CONFIG_NAME, TrainConfig, holds_run
 from .distributed.trainer import new_trainer
 from .errors import TrainerError
+from .options.config import CHECKPOINT_NAME, CONFIG_NAME, TrainConfig, holds_run
 from .results.modelfile import FOLDER, model_path, save_model
 from .results.pictures import loss_plot
 from .results.rendering import Rasterize

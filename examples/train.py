@@ -9,7 +9,7 @@ import torch
 
 from diff_smoe_rasterization import FusedAdam, distCUDA2, io, rasterize
 from diff_smoe_rasterization.losses import l1_ssim_loss
-from dsmoe.config import TrainConfig
+from dsmoe.options.config import TrainConfig
 from dsmoe.scenes.scene import load_scene
 from dsmoe.scenes.synthetic import write_synthetic_scene
 

@@ -13,8 +13,8 @@ import yaml
 
 from diff_smoe_rasterization.settings import GATED_MODES, PAPER, PAPER_PROGRAM, resolve_background_gate
 
-from ..config import LEARNED
 from ..errors import ConfigError
+from ..options.config import LEARNED
 from . import schema
 from .errors import BenchError
 from .names import (

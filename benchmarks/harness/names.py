@@ -8,7 +8,7 @@ from typing import Any, Mapping, Sequence, Union
 
 from diff_smoe_rasterization.settings import EVERYWHERE, GATED_MODES, PAPER, PAPER_PROGRAM
 
-from ..config import RECIPE as TRAINER_RECIPE
+from ..options.config import RECIPE as TRAINER_RECIPE
 from .errors import BenchError
 
 SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}  # suites, by name

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any, Dict, Optional
 
-from ..config import TrainConfig
+from ..options.config import TrainConfig
 from .names import RECIPE
 
 COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit if its files are not a git checkout

@@ -9,7 +9,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 from typing_extensions import Annotated
 
-from ..config import LEARNED
+from ..options.config import LEARNED
 from .errors import BenchError
 from .names import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 from .schema import first_mistake, must

@@ -10,7 +10,7 @@ from typing_extensions import Annotated
 
 from diff_smoe_rasterization.settings import BLEND_MODES, MAX_BACKGROUND_GATE, PAPER
 
-from ..config import LEARNED, PRINCIPAL_POINTS, STRATEGY_NAMES, TrainConfig
+from ..options.config import LEARNED, PRINCIPAL_POINTS, STRATEGY_NAMES, TrainConfig
 from .errors import BenchError
 from .names import CHECKOUTS, LPIPS_KINDS, NATIVE, RECIPE, VARIANTS
 

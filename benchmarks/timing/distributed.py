@@ -21,10 +21,10 @@ import models
 import numpy as np
 import torch
 
-from dsmoe.config import TrainConfig
 from dsmoe.distributed.batch import Batch
 from dsmoe.distributed.shards import run_of
 from dsmoe.distributed.trainer import BatchTrainer
+from dsmoe.options.config import TrainConfig
 from dsmoe.scenes.images import View
 from dsmoe.scenes.pointcloud import PointCloud
 from dsmoe.scenes.scene import Scene

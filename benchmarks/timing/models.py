@@ -13,7 +13,7 @@ from diff_smoe_rasterization.settings import (
     resolve_background_gate,
     resolve_blend_mode,
 )
-from dsmoe.config import TrainConfig
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.modelfile import load_model
 from dsmoe.scenes.cameras import Camera
 from dsmoe.scenes.scene import load_cameras

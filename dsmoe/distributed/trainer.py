@@ -5,9 +5,9 @@ from typing import Any, Callable, Dict, Optional, Sequence
 
 import torch
 
-from ..config import TrainConfig
 from ..errors import TrainerError
 from ..model import PARAMETERS, GaussianModel
+from ..options.config import TrainConfig
 from ..results.evaluation import Evaluation, Measure, rows_of_views, summary
 from ..results.rendering import Rasterize
 from ..scenes.images import View

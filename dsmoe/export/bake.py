@@ -7,10 +7,10 @@ from typing import Any, Dict, NamedTuple, Optional
 
 from diff_smoe_rasterization.settings import resolve_background_gate
 
-from ..config import TrainConfig
 from ..errors import TrainerError
 from ..inspection import compared
 from ..model import GaussianModel, finite_rows
+from ..options.config import TrainConfig
 from ..results.evaluation import evaluate
 from ..results.rendering import Renderer
 from ..results.rows import viewer_warning

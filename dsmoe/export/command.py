@@ -9,10 +9,10 @@ from typing import Any, Dict, Optional, Tuple
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES
 
-from ..choices import BAKE_ITERATIONS
-from ..choices import EXPORT_FORMATS as FORMATS
 from ..errors import TrainerError, printable
 from ..inspection import Trained, open_trained
+from ..options.choices import BAKE_ITERATIONS
+from ..options.choices import EXPORT_FORMATS as FORMATS
 from ..results.modelfile import save_model
 from ..results.pictures import evenly_spaced
 from ..results.rows import blend_name, viewer_warning

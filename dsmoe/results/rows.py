@@ -7,9 +7,9 @@ from typing import Any, Dict, List, Optional, Union
 
 from diff_smoe_rasterization.settings import GATED_MODES
 
-from ..config import LEARNED, TrainConfig, learned_gate_of
 from ..errors import TrainerError
-from ..importance_options import importance_settings
+from ..options.config import LEARNED, TrainConfig, learned_gate_of
+from ..options.importance_options import importance_settings
 from ..scenes.images import DOWNSCALER
 from ..scenes.scene import Scene
 from ..system.environment import machine, versions

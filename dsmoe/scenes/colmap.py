@@ -7,8 +7,8 @@ import numpy as np
 
 from diff_smoe_rasterization import io
 
-from ..config import TrainConfig
 from ..errors import SceneError, said_of
+from ..options.config import TrainConfig
 from ..system.files import is_folder
 from .cameras import Camera, quaternion_to_rotation
 from .layout import Layout, PosedImage, hold_out

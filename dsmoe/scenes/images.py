@@ -15,8 +15,8 @@ from PIL import Image, UnidentifiedImageError
 
 from diff_smoe_rasterization.images import as_float
 
-from ..config import TrainConfig
 from ..errors import SceneError
+from ..options.config import TrainConfig
 from ..system.progress import progress_bar
 from .cameras import Camera
 from .layout import PosedImage

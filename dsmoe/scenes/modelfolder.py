@@ -13,8 +13,8 @@ from typing import Any, Dict, List, Sequence
 import numpy as np
 import torch
 
-from ..config import TrainConfig
 from ..errors import SceneError
+from ..options.config import TrainConfig
 from ..system.files import is_file
 from .cameras import Camera
 from .images import View, fitted_camera, size_of_image

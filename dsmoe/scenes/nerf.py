@@ -14,8 +14,8 @@ import numpy as np
 
 from diff_smoe_rasterization import io
 
-from ..config import TrainConfig
 from ..errors import SceneError, said_of
+from ..options.config import TrainConfig
 from ..system.files import is_file
 from .cameras import LARGEST, Camera
 from .images import image_size

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, Hashable, Iterable, List,
 
 import numpy as np
 
-from ..config import IMAGES, TrainConfig
-from ..early import check_scene
 from ..errors import SceneError
+from ..options.config import IMAGES, TrainConfig
+from ..options.early import check_scene
 from ..system.files import is_file, is_folder
 from ..system.process import command
 from .cameras import LARGEST, Camera, scene_extent

@@ -6,8 +6,8 @@ from typing import Optional
 
 import torch
 
-from ..choices import DEVICES
 from ..errors import TrainerError
+from ..options.choices import DEVICES
 from .environment import extension_info, machine
 
 DEVICE_VARIABLE = "DSMOE_DEVICE"  # what `auto` means, if it is set

@@ -9,9 +9,9 @@ from typing import Any, Dict, Iterator, NamedTuple
 
 import torch
 
-from ..config import CHECKPOINT_NAME, TrainConfig
 from ..errors import TrainerError, out_of_memory
 from ..model import GaussianModel
+from ..options.config import CHECKPOINT_NAME, TrainConfig
 from ..system.files import write_atomically
 from .gate import LearnedGate
 from .state_check import Misfit, check_model, check_numbers

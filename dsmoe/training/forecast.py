@@ -4,10 +4,10 @@ from __future__ import annotations
 import time
 from typing import Optional
 
-from ..config import TrainConfig, flags_text
-from ..presets import FAST
+from ..options.config import TrainConfig, flags_text
+from ..options.presets import FAST
+from ..options.short_run import FLAG, smaller_images
 from ..scenes.scene import Scene
-from ..short_run import FLAG, smaller_images
 
 STEPS = 10  # that are measured, behind the first one, which is slower
 ENOUGH_SECONDS = 20.0  # or as many steps as take so long

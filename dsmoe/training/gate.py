@@ -8,8 +8,8 @@ import torch
 
 from diff_smoe_rasterization.learned_gate import launch_step, step_gate
 
-from ..config import GateOptions
 from ..optimizer import batch_betas
+from ..options.config import GateOptions
 
 
 class LearnedGate:

@@ -12,9 +12,9 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import numpy as np
 import torch
 
-from ..config import TrainConfig
 from ..errors import ConfigError
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
+from ..options.config import TrainConfig
 from ..scenes.images import View
 from .randomness import draw
 from .strategy import Look, SteadyStrategy, Step, StrategyContext, is_due

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import torch
 
-from ..config import TrainConfig
+from ..options.config import TrainConfig
 from .graphs import PIXEL_BYTES
 
 # Numbers of memory that a Gaussian takes at the peak: for each of its parameters that one, its gradient, two moments of

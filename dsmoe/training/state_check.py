@@ -8,8 +8,8 @@ from typing import Any, Dict, Iterator, Sequence, Tuple
 import numpy as np
 import torch
 
-from ..config import LEARNED, TrainConfig
 from ..model import LARGEST_LOG, PARAMETERS, are_numbers
+from ..options.config import LEARNED, TrainConfig
 
 ROWS = {"means3D": (3,), "dc": (1, 3), "opacities": (1,), "scales": (3,), "rotations": (4,)}  # behind [N]
 CHANGING = ("raw", "optimizer", "strategy", "gate", "average")  # what of a state has tensors that a step changes

@@ -16,9 +16,9 @@ from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient, l2_ssim_lo
 from diff_smoe_rasterization.settings import Rendering
 from diff_smoe_rasterization.splats import Splats
 
-from ..config import TrainConfig
 from ..model import GaussianModel, inverse_sigmoid, rotation_matrices
 from ..optimizer import GaussianOptimizer
+from ..options.config import TrainConfig
 from ..results.rendering import Renderer
 from ..scenes.images import View
 from .shards import Shards

@@ -7,10 +7,10 @@ import torch
 
 from diff_smoe_rasterization.images import as_float
 
-from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
 from ..model import GaussianModel
 from ..optimizer import GaussianOptimizer
+from ..options.config import LEARNED, TrainConfig
 from ..results.evaluation import PASSES, Evaluation, Measure, evaluate, psnr_alone
 from ..results.metrics import image_metrics, psnr
 from ..results.modelfile import raw_of

@@ -4,9 +4,9 @@ from __future__ import annotations
 import os
 from typing import Any, List, Optional, Tuple
 
-from ..config import CHECKPOINT_NAME, TrainConfig
 from ..errors import TrainerError
 from ..inspection import Trained, open_trained, places
+from ..options.config import CHECKPOINT_NAME, TrainConfig
 from ..results.modelfile import model_path
 from ..results.rendering import Renderer, background_color
 from ..scenes.cameras import Camera

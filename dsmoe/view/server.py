@@ -15,9 +15,9 @@ import numpy as np
 
 from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES, MAX_BACKGROUND_GATE
 
-from ..choices import VIEW_HOST, VIEW_PORT
 from ..errors import TrainerError
 from ..inspection import to_image
+from ..options.choices import VIEW_HOST, VIEW_PORT
 from ..scenes.cameras import Camera, quaternion_to_rotation
 from ..system.process import pip_install
 from ..system.stopwatch import synchronised_time

@@ -20,7 +20,7 @@ from packaged import packages_and_data
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import extension, reference
-from dsmoe import quickstart_options
+from dsmoe.options import quickstart_options
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "diff_smoe_rasterization"

@@ -89,7 +89,7 @@ def test_options_that_stand_alone_are_options_of_a_training():
 
 def test_the_paper_is_what_the_page_says_it_is():
     from dsmoe.arguments import build_parser
-    from dsmoe.config_arguments import given_options, take_paper
+    from dsmoe.options.config_arguments import given_options, take_paper
 
     said, = re.findall(r"`--paper` is `([^`]*)`", " ".join(PAPER.read_text(encoding="utf-8").split()))
     parsed = [build_parser().parse_args(["train", "SCENE", "-o", "OUT", *words])

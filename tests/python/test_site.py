@@ -145,8 +145,8 @@ def test_the_page_of_settings_says_what_the_code_does(stage):
     from scenes import random_scene
 
     from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize
-    from dsmoe.config import TrainConfig
-    from dsmoe.importance_options import ImportanceOptions, parse_importance_options
+    from dsmoe.options.config import TrainConfig
+    from dsmoe.options.importance_options import ImportanceOptions, parse_importance_options
 
     tables = settings_tables()
     scene = random_scene("smoe", 5, 20, 18)

@@ -23,7 +23,7 @@ from diff_smoe_rasterization.settings import (
     GATED_MODES,
 )
 
-from ...config import LEARNED, TrainConfig
+from ...options.config import LEARNED, TrainConfig
 from ...patches.runtime import STAND_INS
 from ...results.evaluation import Evaluation, summary
 from ...results.pictures import evenly_spaced

@@ -6,9 +6,9 @@ from typing import Any, Dict
 
 import torch
 
-from ...config import CHECKPOINT_NAME, TrainConfig, holds_run
 from ...errors import TrainerError
 from ...inspection import open_renderer
+from ...options.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from ...results.evaluation import evaluate
 from ...results.modelfile import model_path
 from ...results.pictures import evenly_spaced

@@ -6,7 +6,7 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from ...config import TrainConfig
+from ...options.config import TrainConfig
 from ...results.evaluation import Evaluation
 from ...scenes.scene import Scene, load_scene
 from ..errors import BenchError

@@ -8,7 +8,7 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequenc
 
 from diff_smoe_rasterization.settings import BLEND_MODES
 
-from ...config import LEARNED
+from ...options.config import LEARNED
 from ..names import blend_of
 from ..rows import ReportError, Row, at_once
 

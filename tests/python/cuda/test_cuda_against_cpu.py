@@ -22,8 +22,8 @@ from scenes import (
 from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.core import _core
 from diff_smoe_rasterization.settings import OUTPUTS
-from dsmoe.config import TrainConfig
 from dsmoe.model import GaussianModel
+from dsmoe.options.config import TrainConfig
 from dsmoe.scenes.scene import load_cameras, read_layout
 
 

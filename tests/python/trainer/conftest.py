@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 from tiny_scene import one_thread, tiny_scene  # noqa: F401
 
-from dsmoe.config import TrainConfig
+from dsmoe.options.config import TrainConfig
 
 
 @pytest.fixture

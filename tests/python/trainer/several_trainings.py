@@ -4,7 +4,7 @@ from __future__ import annotations
 import json
 import sys
 
-from dsmoe.config import TrainConfig
+from dsmoe.options.config import TrainConfig
 from dsmoe.system.group import join_group, leave_group
 from dsmoe.train import train
 

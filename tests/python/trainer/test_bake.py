@@ -28,7 +28,7 @@ from dsmoe.training.trainer import Trainer
 @pytest.fixture(scope="module")
 def smoe_run(tiny_scene, tmp_path_factory):
     """Trained for a second by a small gate, so that alpha shows its Gaussians much darker."""
-    from dsmoe.config import TrainConfig
+    from dsmoe.options.config import TrainConfig
 
     config = TrainConfig(scene=tiny_scene, output=str(tmp_path_factory.mktemp("run") / "out"), blend_mode="smoe",
                          background_gate=0.01, iterations=250, sh_degree=1, sh_degree_interval=100, checkpoint_every=0)

@@ -12,9 +12,9 @@ from test_resume import killed_and_resumed, ply_bytes
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.losses import fused_ssim
-from dsmoe.config import TrainConfig
 from dsmoe.errors import ConfigError
-from dsmoe.importance_options import importance_settings, parse_importance_options
+from dsmoe.options.config import TrainConfig
+from dsmoe.options.importance_options import importance_settings, parse_importance_options
 from dsmoe.scenes.nerf import random_points
 from dsmoe.scenes.scene import load_scene
 from dsmoe.train import train

@@ -23,8 +23,8 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from dsmoe import cli, inspection
 from dsmoe.cli import main
-from dsmoe.config import TrainConfig
-from dsmoe.config_arguments import GROUPS
+from dsmoe.options.config import TrainConfig
+from dsmoe.options.config_arguments import GROUPS
 from dsmoe.results.modelfile import load_model
 from dsmoe.results.rows import viewer_warning
 from dsmoe.scenes.scene import load_scene

@@ -8,9 +8,9 @@ import os
 
 import pytest
 
-from dsmoe.config import TrainConfig
-from dsmoe.config_arguments import add_arguments, config_from_arguments
 from dsmoe.errors import ConfigError
+from dsmoe.options.config import TrainConfig
+from dsmoe.options.config_arguments import add_arguments, config_from_arguments
 
 # The published defaults of 3DGS (2023).
 PUBLISHED = {

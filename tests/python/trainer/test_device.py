@@ -10,7 +10,7 @@ import torch
 
 from dsmoe.cli import main
 from dsmoe.errors import TrainerError
-from dsmoe.short_run import short_flags, train_command
+from dsmoe.options.short_run import short_flags, train_command
 from dsmoe.system import device, environment
 from dsmoe.system.device import chosen_device, device_line, device_to_train_on
 

@@ -15,8 +15,8 @@ from scipy.optimize import brentq
 
 from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from dsmoe.cli import main
-from dsmoe.config import TrainConfig
 from dsmoe.errors import SceneError
+from dsmoe.options.config import TrainConfig
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera

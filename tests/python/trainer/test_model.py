@@ -9,10 +9,10 @@ import torch
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES
-from dsmoe.config import TrainConfig
 from dsmoe.errors import TrainerError
 from dsmoe.model import PARAMETERS, GaussianModel
 from dsmoe.optimizer import GaussianOptimizer, exponential_rate
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.modelfile import (
     Recorded,
     agreed_background_gate,

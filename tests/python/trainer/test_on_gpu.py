@@ -12,10 +12,10 @@ import torch
 from devices import without_cuda_because
 
 from dsmoe.cli import main
-from dsmoe.config import TrainConfig
 from dsmoe.distributed.trainer import BatchTrainer, new_trainer
 from dsmoe.inspection import evaluate_run
 from dsmoe.model import PARAMETERS
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.simplify import simplify

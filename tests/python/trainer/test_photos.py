@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from diff_smoe_rasterization import io
 from dsmoe import photos
 from dsmoe.cli import main
-from dsmoe.config import TrainConfig
 from dsmoe.errors import SceneError
+from dsmoe.options.config import TrainConfig
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.output_folder import Record, write_record
 

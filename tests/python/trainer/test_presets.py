@@ -8,8 +8,8 @@ from test_cli import fails, results_of
 from test_scene_loading import nerf_folder  # noqa: F401
 
 from dsmoe.cli import main
-from dsmoe.config import TrainConfig
-from dsmoe.presets import NUMBERS, Numbers, chosen_for_scene, with_preset
+from dsmoe.options.config import TrainConfig
+from dsmoe.options.presets import NUMBERS, Numbers, chosen_for_scene, with_preset
 
 
 @pytest.mark.parametrize("words, budget, iterations, until, settings", [

@@ -14,9 +14,10 @@ import pytest
 from PIL import Image
 
 from diff_smoe_rasterization.io import read_colmap, read_gaussians
-from dsmoe import cli, quickstart, short_run
-from dsmoe.presets import FAST
-from dsmoe.quickstart_options import check, given_options, parse
+from dsmoe import cli, quickstart
+from dsmoe.options import short_run
+from dsmoe.options.presets import FAST
+from dsmoe.options.quickstart_options import check, given_options, parse
 from dsmoe.results.pictures import MARGIN, comparison, evenly_spaced, window_of_differences
 from dsmoe.system import files
 

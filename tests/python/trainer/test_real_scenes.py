@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 from real_data import folder
 
-from dsmoe.config import TrainConfig
+from dsmoe.options.config import TrainConfig
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training.trainer import Trainer
 

@@ -17,8 +17,8 @@ from PIL import Image
 
 from diff_smoe_rasterization import io
 from dsmoe import train as runs
-from dsmoe.config import TrainConfig
 from dsmoe.errors import TrainerError, in_one_line
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system import files

@@ -17,8 +17,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import io
-from dsmoe.config import TrainConfig
 from dsmoe.errors import SceneError
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.evaluation import Evaluation
 from dsmoe.results.pictures import file_names
 from dsmoe.results.rows import result_row

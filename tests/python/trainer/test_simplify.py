@@ -16,10 +16,10 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import BLEND_MODES
 from dsmoe import simplify as module
 from dsmoe.cli import main
-from dsmoe.config import TrainConfig
 from dsmoe.errors import ConfigError, TrainerError
 from dsmoe.inspection import open_renderer
 from dsmoe.model import GaussianModel
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.evaluation import evaluate
 from dsmoe.results.metrics import quantised
 from dsmoe.results.modelfile import load_model, model_path, raw_of

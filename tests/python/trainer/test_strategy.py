@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from dsmoe.config import TrainConfig
 from dsmoe.model import PARAMETERS, GaussianModel
 from dsmoe.optimizer import GaussianOptimizer
+from dsmoe.options.config import TrainConfig
 from dsmoe.training.strategies import STRATEGIES
 from dsmoe.training.strategy import Step, Strategy, StrategyContext
 

@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 
-from dsmoe.config import TrainConfig
+from dsmoe.options.config import TrainConfig
 from dsmoe.scenes import synthetic
 from dsmoe.scenes.scene import load_scene
 

@@ -18,8 +18,8 @@ from tiny_scene import one_thread, tiny_scene  # noqa: F401
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import BLEND_MODES
 from dsmoe.cli import main
-from dsmoe.config import TrainConfig
 from dsmoe.inspection import open_trained, to_image
+from dsmoe.options.config import TrainConfig
 from dsmoe.results.rendering import Renderer
 from dsmoe.scenes.scene import load_scene
 from dsmoe.train import Run, train

@@ -3,8 +3,8 @@ from __future__ import annotations
 
 from typing import Any, Collection, Dict, NamedTuple, Optional
 
+from ..errors import ConfigError
 from .config import TrainConfig
-from .errors import ConfigError
 
 STRATEGY = "importance"
 
@@ -58,9 +58,9 @@ def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Di
 
 def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, Any]:
     """Options that depend on the scene, of those whose names are not given. Raises SceneError if it cannot be read."""
-    from .scenes.scene import read_layout
-    from .starting import read_start
-    from .training.importance_strategy import reached_from
+    from ..scenes.scene import read_layout
+    from ..starting import read_start
+    from ..training.importance_strategy import reached_from
 
     if config.init:  # it keeps its number
         return {} if config.budget else {"budget": read_start(config.init).count}

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Callable, Dict
 
-from .errors import ConfigError
+from ..errors import ConfigError
 
 
 def _setting(default: Any, holds: Callable[[Any], bool], requirement: str) -> Any:

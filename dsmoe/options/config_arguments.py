@@ -7,8 +7,8 @@ from typing import Any, Callable, Dict, Optional, Sequence, Union
 
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, PAPER_PROGRAM
 
+from ..errors import ConfigError
 from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
-from .errors import ConfigError
 from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, with_preset
 
 # How `--help` groups the options; those that no group names are of the last one.

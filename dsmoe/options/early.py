@@ -5,10 +5,10 @@ import argparse
 import copy
 import os
 
+from ..errors import SceneError, TrainerError
+from ..system.files import check_output, is_file, is_folder
 from .config import TrainConfig
 from .config_arguments import given_options, take_paper
-from .errors import SceneError, TrainerError
-from .system.files import check_output, is_file, is_folder
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 FROM_VIDEO = "of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"

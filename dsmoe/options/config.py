@@ -20,10 +20,10 @@ from diff_smoe_rasterization.settings import (
     resolve_faint_below,
 )
 
+from ..errors import ConfigError
+from ..system.files import is_file, is_folder, write_text_atomically
 from .choices import DEVICES
-from .errors import ConfigError
 from .importance_options import ImportanceOptions, parse_importance_options
-from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.pt"  # beside it

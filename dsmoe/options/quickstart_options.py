@@ -5,11 +5,11 @@ import argparse
 import sys
 from typing import Any, Dict, List, Optional
 
+from ..errors import SceneError, TrainerError, print_any_name
+from ..system.files import is_file, is_folder
 from .config import TrainConfig
 from .config_arguments import add_arguments
-from .errors import SceneError, TrainerError, print_any_name
 from .presets import NUMBERS, STRATEGY
-from .system.files import is_file, is_folder
 
 MODES = ("alpha", "smoe")
 DEFAULT_FOLDER = "quickstart_output"  # has a folder for each scene

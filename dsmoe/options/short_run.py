@@ -5,7 +5,7 @@ import math
 import shlex
 from typing import Dict
 
-from .system.process import command
+from ..system.process import command
 
 FLAG = "--fast"
 # What two processor cores train in minutes.
