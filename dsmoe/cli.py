@@ -199,7 +199,7 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
         train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
         return
     print(device_line(config.device), flush=True)
-    blend = blend_name(config.blend_mode, config.background_gate, config.faint_below)
+    blend = blend_name(config.blend_mode, config.background_gate, config.unusual_faint)
     budget = f" to {config.budget} Gaussians" if config.budget else ""
     batch = f", {config.batch} views a step" if config.batch > 1 else ""
     processes = f", in {group.size} processes" if group.size > 1 else ""

@@ -123,7 +123,7 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
           f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
     renderer = Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
-                        rasterize, background_gate=gate, faint_below=config.faint_below)
+                        rasterize, background_gate=gate, faint_below=config.unusual_faint)
     return OpenedRun(renderer, so_far.path, so_far)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.settings import GATED_MODES
+from diff_smoe_rasterization.settings import GATED_MODES, usual_faint_below
 
 from .errors import ConfigError, TrainerError
 from .export.glb import glb_gaussians
@@ -194,8 +194,8 @@ def blend_options(start: Start, given: Dict[str, Any]) -> Dict[str, Any]:
     options: Dict[str, Any] = {"blend_mode": mode}
     if mode != start.blend_mode or mode not in GATED_MODES:
         return options
-    if start.faint_below is not None:
-        options["faint_below"] = given.get("faint_below", start.faint_below)
+    own = usual_faint_below(mode) if start.faint_below is None else start.faint_below
+    options["faint_below"] = given.get("faint_below", own)
     if given.get("background_gate", LEARNED) == LEARNED and "background_gate_start" not in given:
         bound = given.get("background_gate_bound", learned_gate_of(mode)["background_gate_bound"])
         options["background_gate_start"] = max(start.background_gate, bound + LEAST_ABOVE_BOUND)

@@ -128,7 +128,7 @@ class Run:
         gate, model = trainer.background_gate, trainer.whole_model()
         if trainer.leads:
             save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate,
-                       config.faint_below)
+                       config.unusual_faint)
         evaluation = trainer.evaluate(self.progress)
         row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation,
                          trainer.evaluate_training_views(self.progress), gate)

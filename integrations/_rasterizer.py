@@ -60,7 +60,13 @@ def _check_axes(name: str, tensor: torch.Tensor, axes: Sequence[Any]) -> None:
 
 
 def pixel_rays(settings: Settings, like: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-    """Returns x [W] and y [H] of the rays (x, y, 1) through the pixels, in the camera's frame."""
+    """Returns x [W] and y [H] of the rays (x, y, 1) through the pixels, in the camera's frame.
+
+    Raises NotImplementedError for a lens, which does not project by projmatrix.
+    """
+    if settings.camera_model != "pinhole":
+        raise NotImplementedError(f"camera_model is {settings.camera_model!r}; rays of pixels are offered for "
+                                  "'pinhole' alone")
     lens = torch.linalg.solve(settings.viewmatrix.to(like), settings.projmatrix.to(like))
     x, y = ((2 * torch.arange(size).to(like) + 1) / size - 1 for size in (settings.image_width, settings.image_height))
     return (x - lens[2, 0]) / lens[0, 0], (y - lens[2, 1]) / lens[1, 1]

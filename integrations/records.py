@@ -13,11 +13,14 @@ import importlib
 import importlib.util
 import json
 import os
+import re
 import shutil
+import socket
 import stat
 import struct
 import sys
 import tempfile
+import time
 from typing import Any, Callable, Dict, Iterator, NamedTuple, Optional, Set, Tuple
 
 import numpy
@@ -31,7 +34,8 @@ __all__ = ["keep"]
 PROGRAM = "diff_smoe_rasterization"
 END, SIGNATURE = 22, b"PK\x05\x06"  # bytes of a zip file's last record without a comment, and its first four
 LONGEST = 65535  # bytes of such a comment
-PART = ".dsmoe_part-"  # begins the name of a folder with a file that is not whole yet; the process's number follows
+PART = ".dsmoe_part-"  # begins the name of a folder with a file that is not whole yet; host and process follow
+ABANDONED = 24 * 3600  # seconds; containers with one host's name do not see each other's processes
 DAMAGE = (ValueError, OverflowError, RecursionError, OSError)
 _kept = False
 _told: Set[str] = set()
@@ -188,10 +192,14 @@ def _folder_beside(target: str) -> str:
         if os.path.exists(target) and not stat.S_ISREG(os.stat(target).st_mode):
             return ""
         where = os.path.dirname(target)
-        for left in glob.glob(os.path.join(glob.escape(where), PART + "*-*")):  # of a process that was killed
-            if not os.path.exists(f"/proc/{os.path.basename(left)[len(PART):].partition('-')[0]}"):
-                shutil.rmtree(left, ignore_errors=True)
-        return tempfile.mkdtemp(prefix=f"{PART}{os.getpid()}-", dir=where)
+        own = f"{PART}{socket.gethostname()}-"
+        for left in glob.glob(os.path.join(glob.escape(where), glob.escape(own) + "*")):
+            process = re.fullmatch(r"(\d+)-\w+", os.path.basename(left)[len(own):])
+            if process and not os.path.exists(f"/proc/{process[1]}"):  # it was killed
+                with contextlib.suppress(OSError):
+                    if time.time() - os.stat(left).st_mtime > ABANDONED:
+                        shutil.rmtree(left, ignore_errors=True)
+        return tempfile.mkdtemp(prefix=f"{own}{os.getpid()}-", dir=where)
     except OSError:
         return ""
 

@@ -11,13 +11,13 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 from diff_smoe_rasterization.settings import (
     BACKGROUND_GATE_VARIABLE,
     BLEND_MODES,
-    FAINT_BELOW_VARIABLE,
     GATED_MODES,
     LEARNED,
     MAX_BACKGROUND_GATE,
     resolve_background_gate,
     resolve_blend_mode,
     resolve_faint_below,
+    usual_faint_below,
 )
 
 from ..errors import ConfigError
@@ -250,6 +250,11 @@ class TrainConfig:
         """
         return self._changed(options).validate()
 
+    @property
+    def unusual_faint(self) -> Optional[float]:
+        """`faint_below`, None if it is as usual in this blend mode."""
+        return None if self.faint_below == usual_faint_below(str(self.blend_mode)) else self.faint_below
+
     def _changed(self, options: Dict[str, Any]) -> TrainConfig:
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             usual = learned_gate_of(str(self.blend_mode))
@@ -318,6 +323,9 @@ class TrainConfig:
         missing = sorted(needed - {*values})
         if missing:
             raise ValueError(f"the option {', '.join(missing)} is missing")
+        if values["blend_mode"] in GATED_MODES and values.get("faint_below") is None:
+            # $DSMOE_FAINT_BELOW is of new runs.
+            values = {**values, "faint_below": usual_faint_below(values["blend_mode"])}
         return cls(**values)
 
     @classmethod
@@ -383,6 +391,8 @@ class TrainConfig:
             before, after = learned_gate_of(self.blend_mode), learned_gate_of(later.blend_mode)
             harmless |= {name for name in before
                          if getattr(self, name) == before[name] and getattr(later, name) == after[name]}
+            if self.unusual_faint is None and later.unusual_faint is None:
+                harmless.add("faint_below")
         texts = []
         for option in dataclasses.fields(self):
             mine, theirs = getattr(self, option.name), getattr(later, option.name)
@@ -439,13 +449,13 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
 
 
 def _training_faint(blend_mode: str, asked: Optional[float]) -> Optional[float]:
-    """The `faint_below` that a training takes and records; None: the mode's own. Raises ValueError."""
+    """The `faint_below` that a training takes and records; None in modes that know none. Raises ValueError."""
     if blend_mode not in GATED_MODES:
         if asked is not None:
             raise ValueError(f"--faint-below is {asked!r}, but the blend mode is {blend_mode}; only "
                              f"{' and '.join(GATED_MODES)} know it")
         return None
-    return resolve_faint_below(blend_mode, asked) if asked is not None or os.environ.get(FAINT_BELOW_VARIABLE) else None
+    return resolve_faint_below(blend_mode, asked)
 
 
 def flags_of(option: dataclasses.Field[Any]) -> Sequence[str]:

@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Sequence, Tuple
 
 import torch
 
-from diff_smoe_rasterization.settings import GATED_MODES, BackgroundGate, GaussianRasterizationSettings, Rendering
+from diff_smoe_rasterization.settings import (
+    GATED_MODES,
+    BackgroundGate,
+    GaussianRasterizationSettings,
+    Rendering,
+    usual_faint_below,
+)
 
 from ..model import GaussianModel
 from ..scenes.cameras import Camera
@@ -33,7 +39,8 @@ class Renderer:
                  deterministic: bool = False) -> None:
         """background: [3] on the model's device. rasterize: by default the package's.
 
-        background_gate, faint_below: of GATED_MODES. A tensor has no gradient, and may change.
+        background_gate, faint_below: of GATED_MODES. A tensor has no gradient, and may change. faint_below None: the
+        mode's usual number, whatever $DSMOE_FAINT_BELOW says.
         """
         self.model = model
         self.blend_mode = blend_mode
@@ -111,7 +118,8 @@ class Renderer:
             changes["bg"] = background
         if self.blend_mode in GATED_MODES:
             changes["background_gate"] = self.background_gate if background_gate is None else background_gate
-            changes["faint_below"] = self.faint_below
+            changes["faint_below"] = (
+                usual_faint_below(self.blend_mode) if self.faint_below is None else self.faint_below)
         return self._settings[id(camera)][1]._replace(**changes)
 
 

@@ -38,8 +38,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         for name in ("background_gate_start", "background_gate_lr"):
             if getattr(config, name) != usual[name]:
                 unusual[name] = getattr(config, name)
-    if config.faint_below is not None:
-        unusual["faint_below"] = config.faint_below
+    if config.unusual_faint is not None:
+        unusual["faint_below"] = config.unusual_faint
     if config.batch > 1:
         unusual["batch"] = config.batch
     if config.deterministic:

@@ -146,7 +146,7 @@ class ImportanceStrategy(SteadyStrategy):
     def after_step(self, step: Step) -> None:
         if self.drops_unneeded and step.reaches(self.context.config.batch):
             self.drop_unneeded()
-        elif any(map(step.reaches, self.removals)):
+        if any(map(step.reaches, self.removals)):  # a large batch has some in the first step too
             self.remove(1 + sum(later > step.iteration for later in self.removals))
         elif any(map(step.reaches, self.moves)):
             self.move()

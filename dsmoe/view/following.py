@@ -74,7 +74,8 @@ class Followed:
         device = self._arguments[-1]
         so_far = made_so_far(config, device)
         renderer = Renderer(so_far.model, str(config.blend_mode), background_color(config.white_background, device),
-                            config.antialiasing, background_gate=so_far.background_gate)
+                            config.antialiasing, background_gate=so_far.background_gate,
+                            faint_below=config.unusual_faint)
         if config != self._config:
             self.cameras, self.orbit = places(config, so_far.model, needed="scene" in self._options)
         self.renderer = renderer

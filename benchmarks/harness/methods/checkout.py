@@ -149,8 +149,8 @@ class ThreeDGS:
         environment = {name: value for name, value in os.environ.items()
                        if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, FAINT_BELOW_VARIABLE,
                                        "PYTHONSAFEPATH")}
-        if self.config.faint_below is not None:
-            environment[FAINT_BELOW_VARIABLE] = str(self.config.faint_below)
+        if self.config.unusual_faint is not None:
+            environment[FAINT_BELOW_VARIABLE] = str(self.config.unusual_faint)
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
 
 

@@ -58,7 +58,7 @@ def test_the_papers_program_is_a_word_among_the_blends(content):
     """smoe, gate 0, all pairs; `smoe` is another blend. A cell that says no faint_below is named as ever."""
     cells = expand(dict(content, blend_modes=["alpha", "paper", "smoe", "smoe_eq7"], faint_belows=[None, 0.9],
                         headline={"blend_modes": ["paper"]}, headline_seeds=[7]), "").cells
-    assert [(blend_of(cell), cell["headline"], cell["seed"], config_of(cell).faint_below) for cell in cells] == [
+    assert [(blend_of(cell), cell["headline"], cell["seed"], config_of(cell).unusual_faint) for cell in cells] == [
         ("alpha", False, 0, None), ("smoe paper", True, 0, 2.0), ("smoe", False, 0, None),
         ("smoe below 0.9", False, 0, 0.9), ("smoe_eq7", False, 0, None), ("smoe_eq7 below 0.9", False, 0, 0.9),
         ("smoe paper", True, 7, 2.0)]

@@ -420,6 +420,9 @@ def test_the_gaussian_of_the_largest_weight_and_where_its_rays_are_deepest(mode,
         assert not images[name][:, ~shown].any()
     with pytest.raises(ValueError, match="needs Gaussians with scales and rotations"):
         mini_splatting.GaussianRasterizer(scene.settings).render_depth(torch.zeros(1, 3), None, torch.ones(1, 1))
+    fisheye = scene.settings._replace(camera_model="fisheye", distortion=(0.0,) * 4)
+    with pytest.raises(NotImplementedError, match="camera_model is 'fisheye'; rays of pixels are offered for"):
+        mini_splatting.GaussianRasterizer(fisheye).render_depth(**scene.inputs)
 
 
 @pytest.mark.parametrize("module, name", [(feature_3dgs, "semantic_feature"), (grouping, "sh_objs")])

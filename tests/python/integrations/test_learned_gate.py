@@ -6,9 +6,11 @@ import json
 import math
 import os
 import re
+import socket
 import stat
 import struct
 import threading
+import time
 import warnings
 
 import numpy as np
@@ -604,9 +606,9 @@ def test_a_mode_without_a_learned_gate_is_recorded_too(kind, mode, tmp_path, pro
 
 
 def test_a_save_that_is_killed_leaves_the_file_of_before(tmp_path, process):
-    """Or a whole one with its record; never one without. What a killed process left goes with the next save."""
+    """Or a whole one with its record; never one without."""
     process("smoe_tn")
-    path, left = tmp_path / "model.pth", tmp_path / ".dsmoe_part-4194305-x"  # no process has that number
+    path = tmp_path / "model.pth"
     torch.save((torch.zeros(3), 7), path)
     before = path.read_bytes()
 
@@ -614,10 +616,24 @@ def test_a_save_that_is_killed_leaves_the_file_of_before(tmp_path, process):
         def __reduce__(self):
             raise KeyboardInterrupt
 
-    left.mkdir()
     with pytest.raises(KeyboardInterrupt):
         torch.save((torch.ones(3), Dies()), path)
     assert path.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["model.pth"]
+
+
+def test_a_save_removes_only_old_folders_of_dead_processes_of_its_host(tmp_path, process):
+    """On a network folder another host, or another container, may be writing under any number."""
+    process("smoe_tn")
+    host = socket.gethostname()
+    dead, alive = 4194305, os.getpid()  # no process has the first number
+    left = {f".dsmoe_part-{name}": days for name, days in {
+        f"{host}-{dead}-x": 2, f"{host}-{dead}-new": 0, f"{host}-{alive}-x": 2, f"{host}-of-another-{dead}-x": 2,
+        f"{host}-{dead}-{dead}-x": 2, f"another-{dead}-x": 2, f"{dead}-x": 2}.items()}
+    for name, days in left.items():
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (time.time() - days * 86400,) * 2)
+    torch.save(torch.zeros(3), tmp_path / "model.pth")
+    assert {one.name for one in tmp_path.iterdir()} == {*left, "model.pth"} - {f".dsmoe_part-{host}-{dead}-x"}
 
 
 def test_a_file_is_written_where_and_as_it_would_be_without_a_record(tmp_path, process):

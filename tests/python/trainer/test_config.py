@@ -80,7 +80,7 @@ def test_a_background_gate_that_the_mode_does_not_know_is_refused(mode, gate, wo
 
 
 def test_faint_below_is_of_the_gated_modes(monkeypatch):
-    assert parse("--blend-mode", "smoe").faint_below is None, "the mode's own"
+    assert parse("--blend-mode", "smoe").faint_below == 0.25, "the mode's own"
     assert parse("--blend-mode", "smoe_eq7", "--faint-below", "0.9").faint_below == 0.9
     with pytest.raises(ConfigError, match="--faint-below is 0.9, but the blend mode is alpha; only smoe and smoe_eq7"):
         parse("--faint-below", "0.9")
@@ -91,6 +91,21 @@ def test_faint_below_is_of_the_gated_modes(monkeypatch):
     given = parse("--blend-mode", "smoe", "--faint-below", "2")
     assert given.faint_below == given.changed(seed=1).faint_below == 2 and given.changed(
         blend_mode="alpha").faint_below is None
+
+
+@pytest.mark.parametrize("recorded", [0.25, None], ids=["as_recorded", "of_an_earlier_version"])
+def test_the_rule_of_faint_pairs_of_a_run_is_not_of_the_variable(monkeypatch, tmp_path, recorded):
+    config = parse("--blend-mode", "smoe")
+    config.save(str(tmp_path))
+    path = tmp_path / "config.json"
+    values = json.loads(path.read_text())
+    assert values["faint_below"] == 0.25
+    path.write_text(json.dumps({**values, "faint_below": recorded}))
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.5")
+    loaded = TrainConfig.load(str(tmp_path), continues=True)
+    assert loaded.faint_below == loaded.changed(iterations=40_000).faint_below == 0.25 and loaded.unusual_faint is None
+    fresh = parse("--blend-mode", "smoe")
+    assert fresh.unusual_faint == 0.5 and "--faint-below is 0.25, not 0.5" in loaded.differences(fresh)
 
 
 def test_another_mode_takes_its_own_background_gate():

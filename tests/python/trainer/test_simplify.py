@@ -16,6 +16,7 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import BLEND_MODES
 from dsmoe import simplify as module
 from dsmoe.cli import main
+from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import ConfigError, TrainerError
 from dsmoe.inspection import open_renderer
 from dsmoe.model import GaussianModel
@@ -26,7 +27,7 @@ from dsmoe.results.modelfile import load_model, model_path, raw_of
 from dsmoe.scenes.colmap import read_colmap_layout
 from dsmoe.scenes.scene import load_scene, read_layout
 from dsmoe.simplify import simplify
-from dsmoe.starting import find_model, read_start
+from dsmoe.starting import blend_options, find_model, read_start, start_renderer
 from dsmoe.train import train
 from dsmoe.training.forecast import Forecast
 from dsmoe.training.importance_strategy import ImportanceStrategy
@@ -137,6 +138,16 @@ def test_what_no_view_needs_goes_first(run):
         assert budget <= trainer.num_gaussians <= count - 3 + left
 
 
+def test_a_large_batch_removes_to_the_budget_from_a_model(run):
+    """All removals fall into the first step, in which also goes what no view needs."""
+    config = run.changed(init=ply_of(run), strategy="importance", budget=20, iterations=128, batch=64,
+                         densify_until_iter=45)
+    trainer = new_trainer(config, load_scene(config, progress=False))
+    assert max(trainer.strategy.removals) <= 64 and trainer.num_gaussians > 20
+    trainer.step()
+    assert trainer.num_gaussians == 20
+
+
 def test_alpha_becomes_smoe_and_a_smoe_model_keeps_its_gate(run, tmp_path, capsys):
     row = simplify(run.output, str(tmp_path / "smoe"), keep=0.5, blend_mode="smoe", **SHORT)
     assert (row["blend_mode"], row["start"]["blend_mode"]) == ("smoe", "alpha")
@@ -236,6 +247,19 @@ def test_what_a_model_says_of_faint_pairs_is_kept(run, tmp_path, capsys):
     assert capsys.readouterr().out.count("all pairs") == 2, "the model and the result"
     assert main(["eval", output, "--device", "cpu"]) == 0
     assert results_of(output)[0]["start"]["protocol"] == {"faint_below": 2}, "measured anew it is kept"
+
+
+def test_a_model_that_says_nothing_of_faint_pairs_has_the_usual_rule(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "2")
+    ply = str(tmp_path / "smoe.ply")
+    io.write_gaussians(ply, dataclasses.replace(io.read_gaussians(ply_of(run)), blend_mode="smoe", background_gate=1.0,
+                                                comments=()))
+    start = read_start(ply)
+    camera = load_scene(run, progress=False).train[0].camera
+    for renderer in (start_renderer(start, run), open_renderer(run, ply, None, "cpu")):
+        assert renderer.settings_of(camera).faint_below == 0.25
+    assert blend_options(start, {})["faint_below"] == 0.25 and blend_options(start, {"faint_below": 1.0})[
+        "faint_below"] == 1.0, "what is typed"
 
 
 def test_a_model_folder_says_where_and_how_it_was_trained(run, tmp_path):
