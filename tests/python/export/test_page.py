@@ -82,9 +82,9 @@ def test_a_browser_counts_faint_pairs_where_the_model_does(browser, tmp_path):  
     camera, background = camera_of(orbit), (0.1, 0.5, 0.9)
     for below in (0.25, 2.0):
         shown = html.Shown("a cloud", "smoe", 0.0, background, False, [camera], orbit, below)
-        (tmp_path / "page.html").write_text(html.page(io.read_gaussians(path), shown), encoding="utf-8")
-        browser.open("about:blank", *SIZE)
-        browser.open(f"file://{tmp_path}/page.html#panel=0", *SIZE)
+        page = tmp_path / f"{below}.html"
+        page.write_text(html.page(io.read_gaussians(path), shown), encoding="utf-8")
+        browser.open(f"file://{page}#panel=0", *SIZE)
         browser.wait_until("document.body && document.body.dataset.drawn === 'true'")
         with torch.no_grad():
             rendered = Renderer(model, "smoe", torch.tensor(background), background_gate=0.0, faint_below=below)(camera)
