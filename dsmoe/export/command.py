@@ -7,7 +7,7 @@ import tempfile
 from typing import Any, Dict, Optional, Tuple
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.settings import GATED_MODES
+from diff_smoe_rasterization.settings import GATED_MODES, leaves_out_faint
 
 from ..errors import TrainerError, printable
 from ..inspection import Trained, open_trained
@@ -95,12 +95,15 @@ def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], ove
     if form == "ply":
         _write_ply(path, trained, gaussians, overwrite)
     else:
-        blend = Blend(renderer.blend_mode, float(renderer.background_gate)) if warning else None
+        blend = Blend(renderer.blend_mode, float(renderer.background_gate), renderer.faint_below) if warning else None
         content = {"html": lambda: html.page(gaussians, _shown(trained)).encode("utf-8"),
                    "splat": lambda: splat_bytes(gaussians), "spz": lambda: spz_bytes(gaussians),
                    "glb": lambda: glb_bytes(gaussians, blend)}[form]()
         write_atomically(path, lambda file: file.write(content), overwrite)
-    if form == "html" or not warning:
+    if form == "html":
+        misses = renderer.blend_mode == "smoe_eq7" and leaves_out_faint("smoe_eq7", renderer.faint_below)
+        return "note: of smoe_eq7 the page draws all pairs, as with faint_below 2" if misses else ""
+    if not warning:
         return ""
     if form == "glb":
         warning = f"note: the .glb requires {BLEND}, so that no viewer shows its {renderer.blend_mode} by alpha"
@@ -122,6 +125,6 @@ def _shown(trained: Trained) -> html.Shown:
     cameras = [trained.cameras[index] for index in evenly_spaced(len(trained.cameras), VIEWS)]
     title = printable(os.path.basename(os.path.abspath(trained.config.scene or trained.path)))
     return html.Shown(title, renderer.blend_mode, float(renderer.background_gate), (red, green, blue),
-                      renderer.antialiasing, cameras, trained.orbit)
+                      renderer.antialiasing, cameras, trained.orbit, renderer.faint_below)
 
 

@@ -11,13 +11,14 @@ from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
+from ..results.modelfile import FAINT_BELOW
 from ..scenes.pointcloud import SH_C0
 from .rows import logits, rotatable_rows, sigmoid, y_up
 
 SPLATTING = "KHR_gaussian_splatting"
 BLEND = "DSMOE_gaussian_splatting_blend"
-"""The extension of models that are not blended by alpha: `blendMode` and `backgroundGate`. It is required, so that a
-viewer that does not know it refuses the file."""
+"""The extension of models that are not blended by alpha: `blendMode`, `backgroundGate`, and `faintBelow` where that
+is not as usual. It is required, so that a viewer that does not know it refuses the file."""
 
 POINTS, VERTICES = 0, 34962  # of glTF: a primitive's mode, a buffer view's target
 FLOAT, UNSIGNED_SHORT = 5126, 5123  # component types
@@ -30,6 +31,7 @@ class Blend(NamedTuple):
 
     mode: str  # one of BLEND_MODES
     background_gate: float
+    faint_below: Optional[float] = None  # as usual
 
 
 def glb_bytes(gaussians: Gaussians, blend: Optional[Blend]) -> bytes:
@@ -90,7 +92,8 @@ def glb_gaussians(content: bytes) -> Gaussians:
             shs=np.stack(harmonics[1:], 1) if harmonics[1:] else np.zeros((len(position), 0, 3), np.float32),
             opacity_logits=logits(arrays[f"{SPLATTING}:OPACITY"]).astype(np.float32), log_scales=log_scales,
             rotations=arrays[f"{SPLATTING}:ROTATION"][:, [3, 0, 1, 2]],
-            blend_mode=blend.get("blendMode", "alpha"), background_gate=blend.get("backgroundGate"))
+            blend_mode=blend.get("blendMode", "alpha"), background_gate=blend.get("backgroundGate"),
+            comments=(f"{FAINT_BELOW} {blend['faintBelow']}",) if "faintBelow" in blend else ())
     except (KeyError, IndexError, TypeError, AttributeError, struct.error, RecursionError) as error:
         raise ValueError(f"not a .glb of Gaussians ({error})") from error
     return y_up(gaussians)
@@ -118,7 +121,10 @@ def _document(blend: Optional[Blend]) -> Dict[str, Any]:
         "accessors": [], "bufferViews": [],
     }
     if blend:
-        splatting["extensions"] = {BLEND: {"blendMode": blend.mode, "backgroundGate": blend.background_gate}}
+        said: Dict[str, Any] = {"blendMode": blend.mode, "backgroundGate": blend.background_gate}
+        if blend.faint_below is not None:
+            said["faintBelow"] = blend.faint_below
+        splatting["extensions"] = {BLEND: said}
         document["extensionsUsed"].append(BLEND)
         document["extensionsRequired"] = [SPLATTING, BLEND]
     return document

@@ -8,11 +8,12 @@ import json
 import os
 import re
 from dataclasses import dataclass
-from typing import Any, Dict, Sequence, Tuple
+from typing import Any, Dict, Optional, Sequence, Tuple
 
 import numpy as np
 
 from diff_smoe_rasterization.io import Gaussians
+from diff_smoe_rasterization.settings import resolve_faint_below
 
 from ..errors import TrainerError
 from ..scenes.cameras import Camera
@@ -40,6 +41,7 @@ class Shown:
     antialiasing: bool
     cameras: Sequence[Camera]  # views to begin with; at least one
     orbit: Orbit  # what dragging turns about
+    faint_below: Optional[float] = None  # of smoe; None: as usual
 
 
 def page(gaussians: Gaussians, shown: Shown) -> str:
@@ -50,6 +52,7 @@ def page(gaussians: Gaussians, shown: Shown) -> str:
     count, first, second = pack(gaussians)
     facts: Dict[str, Any] = {
         "count": count, "degree": gaussians.sh_degree, "mode": shown.blend_mode, "gate": shown.background_gate,
+        "faintBelow": resolve_faint_below("smoe", shown.faint_below),
         "background": list(shown.background), "antialiasing": shown.antialiasing, "up": shown.orbit.up.tolist(),
         "target": shown.orbit.target.tolist(), "cameras": [_plain(camera) for camera in shown.cameras],
     }

@@ -23,7 +23,6 @@ const int ALPHA = 0, SMOE = 1, SMOE_EQ7 = 2;  // RULES: which pairs count
 const float ALPHA_CUT = 1.0 / 255.0;    // alpha: fainter pairs do not count
 const float STRONG_ALPHA = 1.0 / 2040.0;  // smoe: fainter pairs are tails
 const float TAIL_ALPHA = 1.0 / 520200.0;  // smoe: fainter tails do not count
-const float FAINT_BELOW = 0.25;         // smoe: where near pairs have a larger W no others count
 const float KERNEL_CUT = 1e-5;          // smoe_eq7: smaller kernels do not count
 const float CORE_KERNEL = 0.011108996;  // G at 3 sigma, inside which no gate of the background cuts
 const float CORE_ALPHA = 1.0 / 1020.0;   // smoe: there, fainter pairs are faint
@@ -144,6 +143,7 @@ const FRAGMENT = CONSTANTS + `
 uniform vec2 size;
 uniform int rule;
 uniform bool wide;
+uniform float faintBelow;  // smoe: where near pairs have a larger W no others count
 uniform sampler2D near;  // where wide: what the near pairs have drawn
 flat in vec2 mean;
 flat in vec3 conic, colour;
@@ -155,7 +155,7 @@ void main() {
   vec2 d = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - 0.5 - mean;
   float power = -0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) - conic.y * d.x * d.y;
   if (power > 0.0) discard;
-  if (wide && texelFetch(near, ivec2(gl_FragCoord.xy), 0).a >= FAINT_BELOW) discard;
+  if (wide && texelFetch(near, ivec2(gl_FragCoord.xy), 0).a >= faintBelow) discard;
   float kernel = exp(power), logit = opacity * kernel, alpha = min(logit, ALPHA_MAX);
   bool isStrong = alpha >= leastAlpha && (rule != SMOE_EQ7 || kernel >= KERNEL_CUT);
   if (!isStrong && (!wide || alpha < TAIL_ALPHA)) discard;
@@ -170,12 +170,12 @@ const DIVISION = CONSTANTS + `
 uniform sampler2D sums, wideSums, tails;
 uniform int rule;
 uniform vec3 background;
-uniform float backgroundGate;
+uniform float backgroundGate, faintBelow;
 out vec4 pixel;
 
 void main() {
   vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
-  bool isWide = rule == SMOE && sum.a < FAINT_BELOW;
+  bool isWide = rule == SMOE && sum.a < faintBelow;
   if (isWide) sum = texelFetch(wideSums, ivec2(gl_FragCoord.xy), 0);
   float weight = backgroundGate * max(0.0, 1.0 - sum.a);
   if (isWide) weight += texelFetch(tails, ivec2(gl_FragCoord.xy), 0).r;
@@ -187,7 +187,7 @@ void main() {
 const RULES = {alpha: 0, smoe: 1, smoe_eq7: 2};  // the shaders' numbers
 
 class Renderer {
-  // model: {count, degree, antialiasing, background: [3], gaussians, harmonics: Uint32Array}
+  // model: {count, degree, faintBelow, antialiasing, background: [3], gaussians, harmonics: Uint32Array}
   constructor(canvas, model) {
     const gl = canvas.getContext("webgl2", {alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true});
     if (!gl) throw new Error("this browser has no WebGL2");
@@ -279,7 +279,7 @@ class Renderer {
     gl.uniform2f(splat.at("size"), width, height);
     gl.uniform1i(splat.at("degree"), this.model.degree);
     gl.uniform1i(splat.at("rule"), rule), gl.uniform1i(splat.at("antialiasing"), this.model.antialiasing);
-    gl.uniform1f(splat.at("backgroundGate"), gate);
+    gl.uniform1f(splat.at("backgroundGate"), gate), gl.uniform1f(splat.at("faintBelow"), this.model.faintBelow);
     gl.enable(gl.BLEND), gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
     gl.bindVertexArray(this.instances);
     this.drawPairs(this.frame, [gl.COLOR_ATTACHMENT0, gl.NONE], null);
@@ -295,6 +295,7 @@ class Renderer {
     gl.uniform1i(this.divide.at("rule"), rule);
     gl.uniform3fv(this.divide.at("background"), this.model.background);
     gl.uniform1f(this.divide.at("backgroundGate"), gate);
+    gl.uniform1f(this.divide.at("faintBelow"), this.model.faintBelow);
     gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

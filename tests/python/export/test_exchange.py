@@ -1,6 +1,7 @@
 """`dsmoe export` to .glb and .spz: against the texts of the two formats, and read by programs that are not ours."""
 from __future__ import annotations
 
+import dataclasses
 import json
 import struct
 import sys
@@ -12,9 +13,11 @@ import torch
 from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from diff_smoe_rasterization.reference import sh_basis
 from dsmoe.cli import main
+from dsmoe.errors import TrainerError
 from dsmoe.export.glb import glb_bytes
 from dsmoe.export.rows import y_up
 from dsmoe.inspection import open_trained
+from dsmoe.starting import read_start
 
 COUNT = 20
 KHR = "KHR_gaussian_splatting"
@@ -180,6 +183,19 @@ def test_viewers_refuse_a_glb_of_another_blend(export, capsys):
     assert "COLOR_0" not in arrays, "nothing to fall back to"
 
 
+def test_a_glb_says_which_faint_pairs_count_and_is_read_so(export, tmp_path):
+    path = export(dataclasses.replace(cloud("smoe", 0.0), comments=("faint_below 2",)), "model.glb")
+    content = path.read_bytes()
+    splatting = read_glb(content)[0]["meshes"][0]["primitives"][0]["extensions"][KHR]
+    assert splatting["extensions"][OURS] == {"blendMode": "smoe", "backgroundGate": 0, "faintBelow": 2}
+    assert read_start(str(path)).faint_below == 2
+    assert read_start(str(export(cloud("smoe", 0.0), "usual.glb"))).faint_below is None
+    bad = tmp_path / "bad.glb"
+    bad.write_bytes(content.replace(b'"faintBelow":2.0', b'"faintBelow":-20'))
+    with pytest.raises(TrainerError, match="faint_below '-20'; it must be a number of at least 0"):
+        read_start(str(bad))
+
+
 def test_smoe_with_the_gate_of_alpha_is_alpha(export, capsys):
     document, _ = read_glb(export(cloud("smoe_eq7", 1.0), "model.glb").read_bytes())
     assert document["extensionsUsed"] == [KHR] and "note:" not in capsys.readouterr().out
@@ -256,7 +272,6 @@ def test_an_spz_without_gsply_is_refused_with_the_command_that_helps(export, tmp
 
 
 def test_a_glb_of_more_than_4_GiB_is_refused(monkeypatch):
-    from dsmoe.errors import TrainerError
     from dsmoe.export import glb
 
     monkeypatch.setattr(glb, "LARGEST", 4000)

@@ -157,6 +157,17 @@ def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
     assert '"mode": "smoe_eq7", "gate": 0.25' in text
 
 
+@pytest.mark.parametrize("mode, said, drawn, warns", [
+    ("smoe", (), 0.25, False), ("smoe", ("faint_below 2",), 2.0, False),
+    ("smoe_eq7", (), 0.25, False), ("smoe_eq7", ("faint_below 0.9",), 0.9, True)])
+def test_a_page_draws_faint_pairs_where_the_model_has_them(tmp_path, capsys, mode, said, drawn, warns):
+    model, page = str(tmp_path / "trained.ply"), tmp_path / "page.html"
+    io.write_gaussians(model, dataclasses.replace(gaussians(mode, 0.0), comments=said))
+    assert main(["export", model, "-o", str(page)]) == 0
+    assert f'"faintBelow": {drawn},' in page.read_text()
+    assert ("note: of smoe_eq7 the page draws all pairs" in capsys.readouterr().out) == warns
+
+
 @pytest.mark.parametrize("arguments, text", [
     (["-o", "model.obj"], "model.obj: its ending is none of html, ply, splat"),
     (["-o", "model.PLY", "--format", "splat"], "model.PLY: its ending says ply, and --format says splat"),

@@ -74,6 +74,26 @@ def test_a_browser_shows_what_is_rendered(browser, tmp_path, mode, gate, degree,
 
 
 @pytest.mark.slow
+def test_a_browser_counts_faint_pairs_where_the_model_does(browser, tmp_path):  # noqa: F811
+    path, pictures = str(tmp_path / "model.ply"), []
+    io.write_gaussians(path, cloud(degree=0))
+    model, _ = load_model(path, "cpu")
+    orbit = orbit_of_points(io.read_gaussians(path).means3D)
+    camera, background = camera_of(orbit), (0.1, 0.5, 0.9)
+    for below in (0.25, 2.0):
+        shown = html.Shown("a cloud", "smoe", 0.0, background, False, [camera], orbit, below)
+        page = tmp_path / f"{below}.html"
+        page.write_text(html.page(io.read_gaussians(path), shown), encoding="utf-8")
+        browser.open(f"file://{page}#panel=0", *SIZE)
+        browser.wait_until("document.body && document.body.dataset.drawn === 'true'")
+        with torch.no_grad():
+            rendered = Renderer(model, "smoe", torch.tensor(background), background_gate=0.0, faint_below=below)(camera)
+        pictures.append((browser.picture(), to_image(rendered.color)))
+    (usual, mine), (all_pairs, theirs) = pictures
+    assert psnr(usual, mine) > psnr(usual, theirs) and psnr(all_pairs, theirs) > psnr(all_pairs, mine)
+
+
+@pytest.mark.slow
 def test_a_gpu_that_cannot_blend_32_bit_floats_is_told_of(browser, tmp_path):  # noqa: F811
     """Sums of 11 bits: a few grey levels if a pixel has many Gaussians, and the page says so."""
     gaussians = io.Gaussians(**{**vars(cloud()), "blend_mode": "alpha"})
