@@ -1,29 +1,23 @@
 // Adam over several tensors in one launch: a block takes a piece of one of them.
 #include <algorithm>
 
-#include "cuda/tuning.cuh"
 #include "dsmoe/training/adam.h"
 #include "dsmoe/training/gaussians.h"
+#include "ops/pieces.cuh"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
 
-constexpr int kPerBlock = kAdamBlock * kAdamPerThread;
-
-// The tensors of one launch.
 template <class S> struct Batch {
-  AdamTensor<S> tensors[kAdamMaxTensors];
-  int64_t first_block[kAdamMaxTensors];  // of each tensor
-  int count;                             // tensors
-  AdamStep<S> step;                      // what they have in common
+  Pieces<AdamTensor<S>> pieces;
+  AdamStep<S> step;  // what they have in common
 };
 
 template <class S> __global__ void __launch_bounds__(kAdamBlock) adam_kernel(const __grid_constant__ Batch<S> batch) {
-  int t = 0;
-  while (t + 1 < batch.count && blockIdx.x >= batch.first_block[t + 1]) ++t;
-  const AdamTensor<S>& tensor = batch.tensors[t];
-  const int64_t begin = (blockIdx.x - batch.first_block[t]) * kPerBlock + threadIdx.x;
+  const int t = batch.pieces.owner();
+  const AdamTensor<S>& tensor = batch.pieces.tensors[t];
+  const int64_t begin = (blockIdx.x - batch.pieces.first_block[t]) * kPiece + threadIdx.x;
 
   S gradient[kAdamPerThread], parameter[kAdamPerThread], moment[kAdamPerThread], square[kAdamPerThread];
   bool stepped[kAdamPerThread];
@@ -48,31 +42,18 @@ template <class S> __global__ void __launch_bounds__(kAdamBlock) adam_kernel(con
   }
 }
 
-template <class S> void launch(const Batch<S>& batch, int64_t num_blocks, cudaStream_t stream) {
-  if (num_blocks == 0) return;
-  adam_kernel<<<static_cast<unsigned>(num_blocks), kAdamBlock, 0, stream>>>(batch);
-  DSMOE_CHECK_LAUNCH("adam");
-}
-
 }  // namespace
 
 template <class S> void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step, void* stream) {
   refuse_adam("cuda::adam", tensors);
   Batch<S> batch = {};
   batch.step = step;
-  int64_t num_blocks = 0;
-  for (const AdamTensor<S>& tensor : tensors) {
-    if (tensor.size == 0) continue;
-    if (batch.count == kAdamMaxTensors) {
-      launch(batch, num_blocks, static_cast<cudaStream_t>(stream));
-      batch.count = 0, num_blocks = 0;
-    }
-    batch.tensors[batch.count] = tensor;
-    batch.first_block[batch.count] = num_blocks;
-    ++batch.count;
-    num_blocks += (tensor.size + kPerBlock - 1) / kPerBlock;
-  }
-  launch(batch, num_blocks, static_cast<cudaStream_t>(stream));
+  launch_pieces(
+      tensors, batch.pieces, [](const AdamTensor<S>& tensor) { return tensor.size; },
+      [&](unsigned num_blocks) {
+        adam_kernel<<<num_blocks, kAdamBlock, 0, static_cast<cudaStream_t>(stream)>>>(batch);
+        DSMOE_CHECK_LAUNCH("adam");
+      });
 }
 
 template void adam(const std::vector<AdamTensor<float>>&, const AdamStep<float>&, void*);
@@ -164,7 +145,7 @@ template <class S> void step_gaussians(const GaussianAdam<S>& adam, void* stream
   int64_t count = 0;
   for (int t = 0; t < kGaussianAdamTensors; ++t) {
     blocks.first[t] = count;
-    count += blocks_for(adam.num_gaussians * adam.tensors[t].row_size, kAdamBlock * kAdamPerThread);
+    count += blocks_for(adam.num_gaussians * adam.tensors[t].row_size, kPiece);
   }
   step_gaussians_kernel<<<static_cast<unsigned>(count), kAdamBlock, 0, static_cast<cudaStream_t>(stream)>>>(blocks);
   DSMOE_CHECK_LAUNCH("Adam with activations");
