@@ -243,6 +243,14 @@ def usual_faint_below(blend_mode: str) -> float:
     return _FAINT_BELOW.get(blend_mode, EVERYWHERE)
 
 
+def trained_faint_below(blend_mode: str, recorded: Optional[float]) -> float:
+    """Returns the `faint_below` that a model was trained with, whatever $DSMOE_FAINT_BELOW says now.
+
+    recorded: what its file says; None: nothing, as where it was the usual one.
+    """
+    return usual_faint_below(blend_mode) if recorded is None else recorded
+
+
 def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:
     """Returns whether a rendering in this blend mode has pixels in which faint pairs do not count."""
     return blend_mode in GATED_MODES and resolve_faint_below(blend_mode, faint_below) <= 1

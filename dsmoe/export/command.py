@@ -7,7 +7,7 @@ import tempfile
 from typing import Any, Dict, Optional, Tuple
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.settings import GATED_MODES, leaves_out_faint
+from diff_smoe_rasterization.settings import GATED_MODES, leaves_out_faint, trained_faint_below
 
 from ..errors import TrainerError, printable
 from ..inspection import Trained, open_trained
@@ -101,7 +101,8 @@ def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], ove
                    "glb": lambda: glb_bytes(gaussians, blend)}[form]()
         write_atomically(path, lambda file: file.write(content), overwrite)
     if form == "html":
-        misses = renderer.blend_mode == "smoe_eq7" and leaves_out_faint("smoe_eq7", renderer.faint_below)
+        mode = renderer.blend_mode
+        misses = mode == "smoe_eq7" and leaves_out_faint(mode, trained_faint_below(mode, renderer.faint_below))
         return "note: of smoe_eq7 the page draws all pairs, as with faint_below 2" if misses else ""
     if not warning:
         return ""

@@ -13,7 +13,7 @@ from typing import Any, Dict, Optional, Sequence, Tuple
 import numpy as np
 
 from diff_smoe_rasterization.io import Gaussians
-from diff_smoe_rasterization.settings import resolve_faint_below
+from diff_smoe_rasterization.settings import trained_faint_below
 
 from ..errors import TrainerError
 from ..scenes.cameras import Camera
@@ -52,7 +52,7 @@ def page(gaussians: Gaussians, shown: Shown) -> str:
     count, first, second = pack(gaussians)
     facts: Dict[str, Any] = {
         "count": count, "degree": gaussians.sh_degree, "mode": shown.blend_mode, "gate": shown.background_gate,
-        "faintBelow": resolve_faint_below("smoe", shown.faint_below),
+        "faintBelow": trained_faint_below("smoe", shown.faint_below),
         "background": list(shown.background), "antialiasing": shown.antialiasing, "up": shown.orbit.up.tolist(),
         "target": shown.orbit.target.tolist(), "cameras": [_plain(camera) for camera in shown.cameras],
     }

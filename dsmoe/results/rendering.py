@@ -11,7 +11,7 @@ from diff_smoe_rasterization.settings import (
     BackgroundGate,
     GaussianRasterizationSettings,
     Rendering,
-    usual_faint_below,
+    trained_faint_below,
 )
 
 from ..model import GaussianModel
@@ -118,8 +118,7 @@ class Renderer:
             changes["bg"] = background
         if self.blend_mode in GATED_MODES:
             changes["background_gate"] = self.background_gate if background_gate is None else background_gate
-            changes["faint_below"] = (
-                usual_faint_below(self.blend_mode) if self.faint_below is None else self.faint_below)
+            changes["faint_below"] = trained_faint_below(self.blend_mode, self.faint_below)
         return self._settings[id(camera)][1]._replace(**changes)
 
 

@@ -160,7 +160,8 @@ def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
 @pytest.mark.parametrize("mode, said, drawn, warns", [
     ("smoe", (), 0.25, False), ("smoe", ("faint_below 2",), 2.0, False),
     ("smoe_eq7", (), 0.25, False), ("smoe_eq7", ("faint_below 0.9",), 0.9, True)])
-def test_a_page_draws_faint_pairs_where_the_model_has_them(tmp_path, capsys, mode, said, drawn, warns):
+def test_a_page_draws_faint_pairs_where_the_model_has_them(tmp_path, capsys, monkeypatch, mode, said, drawn, warns):
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.5")  # is for trainings
     model, page = str(tmp_path / "trained.ply"), tmp_path / "page.html"
     io.write_gaussians(model, dataclasses.replace(gaussians(mode, 0.0), comments=said))
     assert main(["export", model, "-o", str(page)]) == 0
