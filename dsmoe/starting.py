@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import os
 import re
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.settings import GATED_MODES, usual_faint_below
+from diff_smoe_rasterization.settings import GATED_MODES, trained_faint_below
 
 from .errors import ConfigError, TrainerError
 from .export.glb import glb_gaussians
@@ -105,6 +106,16 @@ def read_start(path: str) -> Start:
 
     Raises TrainerError naming file and reason, also if a Gaussian cannot be shown.
     """
+    try:
+        stamp = os.stat(path)
+    except OSError as error:
+        raise TrainerError(f"{path}: {error.strerror or error}") from error
+    return _read_start(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+@functools.lru_cache(maxsize=1)  # options, scene and training ask for it in turn, and a scene keeps it anyway
+def _read_start(path: str, *_: int) -> Start:
+    """`read_start` of a file as it was changed last."""
     ending = os.path.splitext(path)[1].lower()
     try:
         if ending in READERS:
@@ -194,8 +205,7 @@ def blend_options(start: Start, given: Dict[str, Any]) -> Dict[str, Any]:
     options: Dict[str, Any] = {"blend_mode": mode}
     if mode != start.blend_mode or mode not in GATED_MODES:
         return options
-    own = usual_faint_below(mode) if start.faint_below is None else start.faint_below
-    options["faint_below"] = given.get("faint_below", own)
+    options["faint_below"] = given.get("faint_below", trained_faint_below(mode, start.faint_below))
     if given.get("background_gate", LEARNED) == LEARNED and "background_gate_start" not in given:
         bound = given.get("background_gate_bound", learned_gate_of(mode)["background_gate_bound"])
         options["background_gate_start"] = max(start.background_gate, bound + LEAST_ABOVE_BOUND)
