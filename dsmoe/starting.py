@@ -24,13 +24,12 @@ from .options.config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learne
 from .options.early import check_model
 from .results.evaluation import evaluate
 from .results.modelfile import (
-    Recorded,
     agreed_background_gate,
     agreed_blend_mode,
     model_path,
     raw_of,
     read_ply,
-    recorded_faint,
+    recorded_of,
 )
 from .results.pictures import evenly_spaced
 from .results.rendering import Renderer, background_color
@@ -134,10 +133,9 @@ def _read_start(path: str, *_: int) -> Start:
     if bad or not count:
         what = f"{bad:,} of its {count:,} Gaussians have a number that is NaN or infinite" if bad else "it is empty"
         raise TrainerError(f"{path}: {what}; `dsmoe export MODEL -o clean.glb` leaves such Gaussians out")
-    recorded = Recorded(gaussians.blend_mode, gaussians.background_gate)
+    recorded = recorded_of(path, gaussians)
     mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")
-    return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None),
-                 recorded_faint(path, gaussians.comments))
+    return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None), recorded.faint_below)
 
 
 def find_model(source: str) -> Found:

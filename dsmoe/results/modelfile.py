@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Dict, NamedTuple, Optional, Sequence, Tuple
+from typing import Dict, NamedTuple, Optional, Tuple
 
 import torch
 
@@ -63,7 +63,7 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
         raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
                            "infinite, so the rasterizer shows none; was the training diverging?")
     model = GaussianModel.from_gaussians(raw, stored.sh_degree)
-    return model, Recorded(stored.blend_mode, stored.background_gate, recorded_faint(path, stored.comments))
+    return model, recorded_of(path, stored)
 
 
 def read_ply(path: str) -> io.Gaussians:
@@ -77,13 +77,15 @@ def read_ply(path: str) -> io.Gaussians:
         raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
 
 
-def recorded_faint(path: str, comments: Sequence[str]) -> Optional[float]:
-    said = [line.partition(" ")[2] for line in comments if line.startswith(FAINT_BELOW + " ")]
+def recorded_of(path: str, stored: io.Gaussians) -> Recorded:
+    """What a file says of its blend. Raises TrainerError if its comment on `faint_below` is wrong."""
+    said = [line.partition(" ")[2] for line in stored.comments if line.startswith(FAINT_BELOW + " ")]
     try:
-        return resolve_faint_below("smoe", float(said[-1])) if said else None
+        faint = resolve_faint_below("smoe", float(said[-1])) if said else None
     except ValueError as error:
         raise TrainerError(f"{path}: its comment records {FAINT_BELOW} {said[-1]!r}; it must be a number of at least 0"
                            ) from error
+    return Recorded(stored.blend_mode, stored.background_gate, faint)
 
 
 def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:

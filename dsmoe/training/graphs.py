@@ -43,6 +43,7 @@ class Captured:
         """record: runs a function to capture it, and returns what repeats it."""
         self._record = record
         self.drawn: Any = None
+        self.used = 0  # the step of the training in which it was replayed last
 
     def copies(self, settings: GaussianRasterizationSettings, view: View, background: Optional[torch.Tensor]
                ) -> Tuple[GaussianRasterizationSettings, View, Optional[torch.Tensor]]:
@@ -106,7 +107,6 @@ class Graphs(NoGraphs):
     def __init__(self) -> None:
         self._memory: List[Any] = []  # weak references
         self._captured: Dict[Hashable, Captured] = {}
-        self._used: Dict[Hashable, int] = {}  # the step in which each was replayed last
         self._seen: Dict[Hashable, None] = {}  # kinds that came before
         self._steps = self._launched = 0
         self._too_many: float = math.inf  # Gaussians, with whose graphs the memory did not suffice
@@ -139,15 +139,14 @@ class Graphs(NoGraphs):
             while len(self._seen) > MOST_SEEN:
                 del self._seen[next(iter(self._seen))]
         else:
-            self._used[kind] = self._steps
+            found.used = self._steps
         return found
 
     def _is_due(self, kind: Hashable) -> bool:
         """Whether a kind without a graph is to be captured: it came before, and there is a place for it."""
         if kind not in self._seen or self._launched < WARM_UP:
             return False
-        for other in [other for other in self._captured if self._steps - self._used[other] > IDLE]:
-            del self._captured[other]
+        self._captured = {other: graph for other, graph in self._captured.items() if self._steps - graph.used <= IDLE}
         return len(self._captured) < MOST_KINDS
 
     def _capture(self, num_gaussians: int, capture: Callable[[Captured], None]) -> Optional[Captured]:
