@@ -32,6 +32,7 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
         if tensor is not None:
             inputs[name] = optional(name, tensor)
     look_for_raw_values(function, inputs, settings.debug)
+    # Only background_gate="learned" reads the tensors: that gate waits for the step of the optimizer that has means3D.
     background_gate = gate_of(background_gate, blend_mode, inputs.values(), means3D)
     fixed_gate = background_gate
     if isinstance(background_gate, torch.Tensor):

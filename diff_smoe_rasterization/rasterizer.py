@@ -23,7 +23,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
         settings: camera and options. Its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
-            differentiable too, each on its own.
+            differentiable too, each on its own. With background_gate="learned", and only then, the rendering is a step
+            of a training: the gate of this process is stepped when the optimizer that holds means3D is.
         means2D: [N, 3]; only its gradient is used: dL/d(pixel) times (width / 2, height / 2), z = 0.
             Densification reads it.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.

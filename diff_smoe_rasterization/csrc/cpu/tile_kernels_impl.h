@@ -1,4 +1,4 @@
-// The kernels of one instruction set. Included once per instruction set that the compiler can build for.
+// The kernels of one instruction set (simd_target.h), for numbers of type DSMOE_NUMBER, as constant DSMOE_TILE_KERNELS.
 #pragma once
 
 #include "tile_backward_impl.h"
@@ -15,5 +15,8 @@ template <class S> constexpr TileKernels<S> kernels() {
 }
 
 }  // namespace DSMOE_SIMD
+
+constexpr TileKernels<DSMOE_NUMBER> DSMOE_TILE_KERNELS = DSMOE_SIMD::kernels<DSMOE_NUMBER>();
+
 }  // namespace cpu
 }  // namespace dsmoe
