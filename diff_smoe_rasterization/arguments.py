@@ -55,8 +55,8 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
     # Unchanged by conversion: so it was not a string (float() and bool() take those) and lost no digits.
     if options != given or not all([-_WHOLE_LIMIT < options[place] < _WHOLE_LIMIT for place in _WHOLE_OPTIONS]):
         for (name, kind), value in zip(_SETTING_OPTIONS, given):
-            if not _fits(kind, value):
-                raise ValueError(f"{function}: {name} is {value!r}; it must be {_KINDS[kind]}")
+            if not fits(kind, value):
+                raise ValueError(f"{function}: {name} is {value!r}; it must be {KINDS[kind]}")
     faint_below = resolve_faint_below(blend_mode, settings.faint_below)
     model, lens = resolve_lens(settings)
     computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens,
@@ -66,8 +66,8 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
     return options
 
 
-def _fits(kind, value):
-    """Whether a setting can be an option of this type."""
+def fits(kind, value):
+    """Whether a setting can be an option of this type, a key of KINDS."""
     try:
         option = kind(value)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a tensor of several elements
@@ -76,7 +76,7 @@ def _fits(kind, value):
 
 
 _OUTPUTS = frozenset(OUTPUTS)
-_KINDS = {int: "a whole number below 2^63", float: "a number", bool: "True or False"}
+KINDS = {int: "a whole number below 2^63", float: "a number", bool: "True or False"}
 _WHOLE_LIMIT = 2**63
 
 # The options that are computed, with their places; the others are settings of the same name. `rasterize_op` decides
