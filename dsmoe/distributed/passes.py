@@ -18,7 +18,7 @@ from ..training.strategy import Look, Step, look_at
 from .batch import Batch
 
 
-@dataclass
+@dataclass(repr=False)
 class BatchStep(Step):
     """A step of `BatchPasses`."""
 

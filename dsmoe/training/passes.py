@@ -52,7 +52,7 @@ def add_gradient(model: GaussianModel, name: str, number: float) -> None:
     value.backward(torch.full_like(value, number))
 
 
-@dataclass
+@dataclass(repr=False)  # that of a ViewStep: it has no fields that `backward` deletes
 class AutogradStep(ViewStep):
     """A step of `AutogradPasses`."""
 
