@@ -244,6 +244,8 @@ def _simplify(arguments: argparse.Namespace) -> None:
     print(results_table([row["start"], row]))
     if row["protocol"]["scene_kind"] == "model":
         print("measured against renderings of the model: there are no photographs")
+    if row["start"].get("psnr_train") is not None:
+        print(f"the training views have {row['psnr_train']:.2f} dB, and {row['start']['psnr_train']:.2f} dB before")
     if viewer_warning(row):
         print(viewer_warning(row))
     path = model_path(arguments.output, row["protocol"]["iterations"])

@@ -75,6 +75,7 @@ class Found:
     path: str
     options: Dict[str, Any] = field(default_factory=dict)  # of TrainConfig, that its folder records; `scene` too
     teacher: Dict[str, Any] = field(default_factory=dict)  # others in their place, for its renderings as the scene
+    missing: str = ""  # a scene that its folder names and that is not there
 
 
 class Quality(NamedTuple):
@@ -124,8 +125,10 @@ def _read_start(path: str, *_: int) -> Start:
             gaussians = read_ply(path)
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
-    except TrainerError:
-        raise
+    except TrainerError as error:
+        if "this is no PLY file" not in str(error) or ending == ".ply":
+            raise
+        raise TrainerError(f"{path}: it is none of .ply, .splat, .spz and .glb") from error
     except ValueError as error:
         raise TrainerError(f"{path}: {error}") from error
     count = len(gaussians.means3D)
@@ -152,8 +155,8 @@ def find_model(source: str) -> Found:
     options = _options_of_3dgs(source)
     if is_folder(options.get("scene", "")):
         return Found(path, options)
-    options.pop("scene", None)
-    return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {})
+    missing = options.pop("scene", "")
+    return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {}, missing)
 
 
 def _found_run(folder: str) -> Found:
@@ -170,7 +173,7 @@ def _found_run(folder: str) -> Found:
         return Found(path, {**options, "scene": config.scene})
     # Its cameras.json has those of the resized images.
     teacher = {"scene": folder, "resolution": 1, "principal_point": "scene", "lenses": TrainConfig().lenses}
-    return Found(path, options, teacher if is_file(os.path.join(folder, CAMERAS)) else {})
+    return Found(path, options, teacher if is_file(os.path.join(folder, CAMERAS)) else {}, config.scene)
 
 
 def _options_of_3dgs(folder: str) -> Dict[str, Any]:
@@ -244,6 +247,6 @@ def check_start(scene: Scene, config: TrainConfig) -> Quality:
     if max(quality.psnr, quality.centred) < LEAST_PSNR:
         raise TrainerError(f"{start.path} does not show {config.scene}: {there:.1f} dB on its images, and it must be "
                            f"at least {LEAST_PSNR:g}. Is it another scene, are its poses others than those of the "
-                           "training (some programs move and scale them), or was its background white "
-                           "(--white-background)?")
+                           "training (some programs move and scale them), or was its background "
+                           + ("black (now it is white)?" if config.white_background else "white (--white-background)?"))
     return quality
