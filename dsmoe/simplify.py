@@ -3,9 +3,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from typing import Any, Callable, Dict, List, NamedTuple, Optional
 
-from .errors import ConfigError, TrainerError
+from .errors import ConfigError, SceneError, TrainerError
 from .inspection import open_renderer
 from .options.choices import SIMPLIFY_ITERATIONS
 from .options.config import TrainConfig, holds_run
@@ -67,7 +68,7 @@ def simplify(model: str, output: str, *, scene: Optional[str] = None, budget: Op
     if finds_center and resume and holds_run(output):
         config = config.changed(principal_point=TrainConfig.load(output).principal_point)
     earlier_files(config, resume, overwrite)
-    measured = _measure(config, start, say, progress, finds_center, found.missing)
+    measured = _measure(config, start, say, progress, finds_center, found)
     if loses is None:
         row = train(measured.config, resume, overwrite, progress, scene=measured.scene, say=say)
     else:
@@ -85,7 +86,7 @@ def _config(model: str, found: Found, start: Start, given: Dict[str, Any]) -> Tr
     if start.blend_mode != "alpha" and mode != start.blend_mode:
         raise ConfigError(f"{model} is blended by {start.blend_mode}, and --blend-mode is {mode}; simplify it as it "
                           "is, then `dsmoe export OUT --bake alpha -o model.ply` makes an alpha model of it")
-    recorded = {**found.options, **({} if given.get("scene") else found.teacher)}
+    recorded = found.options_on(given.get("scene") or "")
     if mode != recorded.pop("blend_mode", mode):
         recorded.pop("background_gate", None)
     options = {**blend, **recorded, **given, "blend_mode": mode, "init": found.path}
@@ -124,19 +125,24 @@ def _ladder(count: int) -> List[int]:
 
 
 def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], None]], progress: bool,
-             finds_center: bool, missing: str) -> _Measured:
+             finds_center: bool, found: Found) -> _Measured:
     """Loads the scene, and looks whether the model shows it. Raises TrainerError.
 
-    missing: a scene that its folder names and that is not there. finds_center: whether the model may tell where its
-    program had the principal points.
+    finds_center: whether the model may tell where its program had the principal points.
     """
     config.validate()
-    layout = read_layout(config)
+    try:
+        layout = read_layout(config)
+    except SceneError as error:
+        if not found.teacher or config.scene != found.options.get("scene"):
+            raise
+        raise SceneError(f"{error}; --scene {shlex.quote(str(found.teacher['scene']))} takes the model's renderings in "
+                         "place of photographs") from error
     scene = load_scene(dataclasses.replace(config, init=""), progress, layout).starting_with(start)
     if say:
-        if missing and scene.kind == "model":
-            say(f"note: the scene that its folder names, {missing}, is not there; the model's renderings take the "
-                "place of photographs, unless --scene names these")
+        if found.missing and scene.kind == "model":
+            say(f"note: the scene that its folder names, {found.missing}, is not there; the model's renderings take "
+                "the place of photographs, unless --scene names these")
         say(f"{start.path}: {start.count:,} Gaussians of SH degree {start.gaussians.sh_degree}, blend mode "
             f"{start.blend_mode}, {os.path.getsize(start.path) / 1e6:.1f} MB")
         say(describe_scene(scene, layout, config))

@@ -212,6 +212,29 @@ def test_a_run_whose_scene_is_gone_is_its_own_teacher(run, tmp_path):
             assert np.allclose(view.camera.translation, photograph.camera.translation, atol=1e-12)
 
 
+def test_a_scene_without_its_photographs_leaves_the_models_renderings(run, tmp_path, capsys):
+    scene = str(tmp_path / "scene")
+    shutil.copytree(run.scene, scene)
+    shutil.rmtree(os.path.join(scene, "images"))
+    (tmp_path / "model").mkdir()
+    folder = model_folder(run, tmp_path / "model", f"Namespace(eval=False, source_path={scene!r})")
+    words = ["simplify", folder, "--budget", "40", "-o", str(tmp_path / "out"), "--iterations", "8", "--device", "cpu"]
+    assert main(words) == 1
+    text = capsys.readouterr().err
+    assert "no such folder of images" in text and f"--scene {folder} takes the model's renderings" in text
+    assert not (tmp_path / "out").exists() and main([*words, "--scene", folder]) == 0
+    said, row = capsys.readouterr().out, results_of(str(tmp_path / "out"))[0]
+    assert f"the training views have {row['psnr_train']:.2f} dB\n" in said and row["start"]["psnr"] is None
+
+
+def test_a_run_is_its_own_teacher_at_the_size_of_its_images_if_asked(run, tmp_path):
+    """Its cameras.json has those; dividing them again would be wrong."""
+    shutil.copytree(run.output, tmp_path / "run")
+    TrainConfig.load(run.output).changed(resolution=2, output=str(tmp_path / "run")).save(str(tmp_path / "run"))
+    row = simplify(str(tmp_path / "run"), str(tmp_path / "out"), scene=str(tmp_path / "run"), budget=40, **SHORT)
+    assert (row["protocol"]["scene_kind"], row["protocol"]["image_size"]) == ("model", [30, 22])
+
+
 def test_a_run_knows_how_its_scene_is_loaded_wherever_that_lies(run, tmp_path):
     scene, moved = str(tmp_path / "scene"), str(tmp_path / "moved")
     shutil.copytree(run.scene, scene)
