@@ -253,7 +253,10 @@ def _simplify(arguments: argparse.Namespace) -> None:
         print(viewer_warning(row))
     path = model_path(arguments.output, row["protocol"]["iterations"])
     print(f"model: {printable(path)}, {os.path.getsize(path) / 1e6:.1f} MB of {row['start']['bytes'] / 1e6:.1f} MB")
-    print(f"for the web: {command()} export {shlex.quote(arguments.output)} -o model.spz")
+    # Viewers blend by alpha; to bake a model to that needs photographs.
+    bakes = row["blend_mode"] != "alpha" and row["protocol"]["scene_kind"] != "model"
+    web = "model.spz" if bakes or row["blend_mode"] == "alpha" else "model.html"
+    print(f"for the web: {command()} export {shlex.quote(arguments.output)}{' --bake alpha' * bakes} -o {web}")
 
 
 def _train_config(arguments: argparse.Namespace) -> Tuple[TrainConfig, Optional[Layout]]:

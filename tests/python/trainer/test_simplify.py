@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import struct
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from dsmoe import simplify as module
 from dsmoe.cli import main
 from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import ConfigError, TrainerError
+from dsmoe.export.glb import glb_bytes
 from dsmoe.inspection import open_renderer
 from dsmoe.model import GaussianModel
 from dsmoe.options.config import TrainConfig
@@ -90,6 +92,7 @@ def test_a_run_becomes_one_of_fewer_gaussians(run, tmp_path, capsys):
         assert row["start"][name] == pytest.approx(trained[name], rel=1e-6)
     assert row["protocol"]["resolution"] == 30 and row["protocol"]["init"] == "point_cloud.ply"
     assert f"{trained['num_gaussians']:,} Gaussians of SH degree 1, blend mode alpha" in said
+    assert f"export {output} -o model.spz" in said
     assert open(ply_of(run), "rb").read() == before, "the model itself stays"
 
 
@@ -112,6 +115,9 @@ def test_removals_begin_at_once_and_nothing_grows(run):
     scene = load_scene(config, progress=False)
     assert Forecast(config, scene).text(10, 2000.0) == (
         "at this speed the other 10 iterations take about 33 min, less and less as Gaussians are removed")
+    count = len(scene.points.positions)
+    for budget, words in ((count, " about 33 min"), (count + 1, "longer as Gaussians are added")):
+        assert Forecast(config.changed(budget=budget), scene).text(10, 2000.0).partition(". A GPU")[0].endswith(words)
     strategy = Trainer(config, scene).strategy
     assert isinstance(strategy, ImportanceStrategy)
     assert strategy.removals[0] == 4 and strategy.growth_ends == 0, "2 % of 200"
@@ -156,12 +162,12 @@ def test_alpha_becomes_smoe_and_a_smoe_model_keeps_its_gate(run, tmp_path, capsy
     stored = dataclasses.replace(io.read_gaussians(ply_of(config)), background_gate=0.375, comments=())
     ply = str(tmp_path / "smoe.ply")
     io.write_gaussians(ply, stored)
-    for words in (["simplify", ply, "--scene", run.scene, "--budget", "30"], ["train", run.scene, "--init", ply]):
+    for words in (["train", run.scene, "--init", ply], ["simplify", ply, "--scene", run.scene, "--budget", "30"]):
         output = str(tmp_path / words[0])
         assert main([*words, "-o", output, "--iterations", "4", "--resolution", "30", "--quiet"]) == 0
         config = TrainConfig.load(output)
         assert (config.blend_mode, config.background_gate, config.background_gate_start) == ("smoe", "learned", 0.375)
-    capsys.readouterr()
+    assert f"export {output} --bake alpha -o model.spz" in capsys.readouterr().out, "viewers of .spz blend by alpha"
     assert main(["simplify", ply, "--scene", run.scene, "--budget", "30", "-o", str(tmp_path / "no"), "--blend-mode",
                  "alpha"]) == 1
     assert "dsmoe export OUT --bake alpha" in capsys.readouterr().err
@@ -613,3 +619,29 @@ def test_what_is_no_glb_of_gaussians_is_named(tmp_path):
             file.write(content)
         with pytest.raises(TrainerError, match="m.glb: "):
             read_start(path)
+
+
+@pytest.mark.parametrize("place, value, words", [
+    (("accessors", 2, "count"), 5, "KHR_gaussian_splatting:SCALE has 5 rows of 3 numbers; it must have 6 of 3"),
+    (("accessors", 2, "count"), -1, "accessor 2 has -1 rows of 3 numbers from byte 168 on"),
+    (("accessors", 2, "count"), 99, "bytes of them (truncated file?)"),
+    (("meshes", 0, "primitives", 0, "attributes", "KHR_gaussian_splatting:SCALE"), 1, "SCALE has 6 rows of 4 numbers"),
+])
+def test_a_glb_whose_attributes_do_not_fit_is_told(tmp_path, place, value, words):
+    """The scales are the third accessor, behind positions and rotations: 6 (3 + 4) numbers of 4 bytes."""
+    rows = np.ones((6, 4), np.float32)
+    content = glb_bytes(io.Gaussians(means3D=rows[:, :3], dc=rows[:, None, :3], shs=np.zeros((6, 0, 3), np.float32),
+                                     opacity_logits=rows[:, :1], log_scales=rows[:, :3], rotations=rows), None)
+    begin = content.index(b"BIN\0") - 4
+    document = json.loads(content[20:begin])
+    part = document
+    for name in place[:-1]:
+        part = part[name]
+    part[place[-1]] = value
+    text = json.dumps(document).encode()
+    path = str(tmp_path / "m.glb")
+    with open(path, "wb") as file:
+        file.write(content[:12] + struct.pack("<I4s", len(text), b"JSON") + text + content[begin:])
+    with pytest.raises(TrainerError) as error:
+        read_start(path)
+    assert words in str(error.value)
