@@ -221,6 +221,9 @@ def _lens(model: Any, is_fisheye: bool, coefficients: Dict[str, float], where: s
     if model == "OPENCV_FISHEYE":
         return lens_of(model, True, coefficients)
     if model == AROUND:
+        bent = next((key for key, value in coefficients.items() if value), None)
+        if bent:
+            raise SceneError(f"{where}: `{bent}` is not 0; `camera_model` {AROUND} has no lens distortion")
         return Lens(AROUND, False, ())
     if model not in PERSPECTIVE_MODELS:
         raise SceneError(f"{where}: `camera_model` is {reprlib.repr(model)}; it must be one of "

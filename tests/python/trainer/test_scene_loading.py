@@ -712,6 +712,7 @@ def frame(**values):
     (lambda content: content.update(camera_angle_x="wide"), ["camera_angle_x", "wide"]),
     (lambda content: content.update(camera_angle_x=4.0), ["camera_angle_x", "4.0"]),
     (lambda content: content.update(k4=0.1), ["`k4` is of a fisheye's lens", "OPENCV"]),
+    (lambda content: content.update(k1=0.1, camera_model="EQUIRECTANGULAR"), ["`k1` is not 0", "EQUIRECTANGULAR"]),
     (frame(camera_model="ORTHOPHOTO"), ["frame 0", "EQUIRECTANGULAR", "OPENCV_FISHEYE"]),
     (frame(mask_path="masks/none.png"), ["frame 0", "`mask_path`", "no such file"]),
     (lambda content: content.update(cx="middle"), ["cx", "middle"]),
