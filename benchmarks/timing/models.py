@@ -63,7 +63,7 @@ def from_files(ply: str, scene: str, resolution: int) -> Model:
     model, _ = load_model(ply, "cpu")
     inputs = dict(means3D=model.raw["means3D"], opacities=model.opacities, scales=model.scales,
                   rotations=model.rotations, shs=torch.cat([model.raw["dc"], model.raw["shs"]], 1))
-    cameras = load_cameras(TrainConfig(scene=scene, resolution=resolution), "test")
+    cameras = [camera.pinhole() for camera in load_cameras(TrainConfig(scene=scene, resolution=resolution), "test")]
     return Model(ply, {name: tensor.detach().contiguous() for name, tensor in inputs.items()}, cameras)
 
 
