@@ -154,7 +154,7 @@ def test_lpips_of_a_file_agrees_with_the_definition(kind, weights, tmp_path, mon
     if weights == "made up":
         made_up_weights(path, net)
     else:
-        path = real_data.folder("bonsai").replace("bonsai", "lpips_alex_v01.npz")
+        path = real_data.folder("lpips_alex_v01.npz")
     monkeypatch.setenv(f"DSMOE_LPIPS_{net.upper()}", path)
     measures = Measures("cpu", [kind])
     image, target = torch.from_numpy(np.random.RandomState(1).rand(2, 3, 64, 72).astype(np.float32))
