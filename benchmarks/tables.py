@@ -231,14 +231,71 @@ def transmittance_table() -> str:
                        for blend in ("smoe_eq7", *ABLATED))] for end in (0.005, 0.0002)))
 
 
+TRAINERS = {"3dgs-2023": "3DGS of 2023", "c3dgs": "c3dgs", "compact-3dgs": "Compact-3DGS", "taming": "Taming",
+            "hac": "HAC", "hac-plus": "HAC++"}
+
+
+def plugged_rows() -> Dict[Tuple[str, str], Dict[str, Row]]:
+    """The suite `table2` on bonsai, by trainer and end ("sparse", "dense"), then by rule."""
+    rows = [row for row in rows_of("table2_h200.jsonl") if row["suite"] == "table2" and row["scene"] == "bonsai"
+            and row["variant"] == "patched" and row["seed"] == 0]
+    found: Dict[Tuple[str, str], Dict[str, Row]] = {}
+    for method, end in ((method, end) for method in TRAINERS for end in ("sparse", "dense")):
+        chosen = {rule_of(row): row for row in rows if row["method"] == method and end_of(row) == end}
+        if len(chosen) > 1:  # a row alone is compared with nothing
+            found[method, end] = chosen
+    return found
+
+
+def end_of(row: Row) -> str:
+    return row["end"] or ("sparse" if row["densify_grad_threshold"] > 0.001 else "dense")
+
+
+def rule_of(row: Row) -> str:
+    """Of RULES."""
+    return ("alpha" if row["blend_mode"] == "alpha" else "learned" if row["background_gate"] == "learned" else
+            "program")
+
+
+def megabytes(row: Row) -> float:
+    return row["size_bytes"]["own"] / 1e6
+
+
+def table_2() -> str:
+    """PSNR, LPIPS, primitives and megabytes of the file."""
+    lines = []
+    for (method, end), rules in plugged_rows().items():
+        lines.append([f"{TRAINERS[method]}, {end}", *("–" if rule not in rules else ", ".join(
+            [*figures([rules[rule]])[::2], thousands([rules[rule]]), f"{megabytes(rules[rule]):.2f}"])
+            for rule in RULES)])
+    return table(["PSNR, LPIPS, number, MB", *RULES.values()], lines)
+
+
+def between(points: Sequence[Tuple[float, float]], at: float) -> float:
+    """y at an x within two points (x, y), interpolated over the logarithm of the first."""
+    (left, low), (right, high) = points
+    return low + (high - low) * math.log(at / left) / math.log(right / left)
+
+
+def equal_size(method: str, rule: str) -> Tuple[List[float], List[float]]:
+    """A rule against alpha where the sizes and the PSNR of both ends overlap: dB at equal megabytes, and per cent of
+    megabytes at equal PSNR, at both ends of the overlap."""
+    cells = plugged_rows()
+    curves = [[(megabytes(cells[method, end][name]), cells[method, end][name]["psnr"]) for end in ("sparse", "dense")]
+              for name in ("alpha", rule)]
+    sizes, levels_ = ([(max(one[0][axis] for one in curves)), min(one[1][axis] for one in curves)] for axis in (0, 1))
+    gains = [between(curves[1], size) - between(curves[0], size) for size in sizes]
+    at = [[number_at(curve, level) or math.nan for curve in curves] for level in levels_]
+    return gains, [100 * (smoe / alpha - 1) for alpha, smoe in at]
+
+
 RULES = {"alpha": "alpha", "learned": "smoe", "program": "the authors' program"}
 
 
 def timed() -> Dict[Tuple[str, str], Row]:
     """Trainings by the recipe at 0.0002 that were alone on a card, by scene and rule."""
     rows = [row for row in rows_of("paper_suites_h200.jsonl") if row["suite"] == "fig5"]
-    return {(row["scene"], "alpha" if row["blend_mode"] == "alpha" else "learned" if row["background_gate"] == "learned"
-             else "program"): row for row in rows}
+    return {(row["scene"], rule_of(row)): row for row in rows}
 
 
 def time_table() -> str:
@@ -414,6 +471,16 @@ def sentences() -> Dict[str, List[str]]:
     sparse_plugged = plugged(("3dgs-2023", "3dgs-2024", "c3dgs"), "sparse")
     dense_plugged = plugged(("3dgs-2023", "c3dgs"), "dense")
     bounded = plugged(("taming", "hac", "hac-plus"), "sparse")[0], plugged(("taming", "hac", "hac-plus"), "dense")[0]
+    found = plugged_rows()
+    compact = [found["compact-3dgs", "sparse"][rule] for rule in RULES]
+    compact_gains = span([row["psnr"] - compact[0]["psnr"] for row in compact[1:]], 1)
+    compact_more = span([-fewer([row], compact[:1]) for row in compact[1:]])
+    compact_smaller = span([100 * (1 - megabytes(row) / megabytes(compact[0])) for row in compact[1:]])
+    hac = [(found["hac", end]["alpha"], found["hac", end][rule]) for end in ("sparse", "dense") for rule in RULES
+           if rule != "alpha"]
+    hac_gains = span([smoe["psnr"] - alpha["psnr"] for alpha, smoe in hac], 2, "+")
+    equal_gains, equal_sizes = ([value for rule in RULES if rule != "alpha" for value in equal_size("hac", rule)[kind]]
+                                for kind in (0, 1))
     newest = plugged_2024()
     newest_loss = [less(alpha, smoe, "psnr") for alpha, smoe in newest]
     fast = {blend: fast_runs(blend) for blend in BLENDS}
@@ -429,6 +496,7 @@ def sentences() -> Dict[str, List[str]]:
     newest_span = f"3DGS of 2024 loses {span(newest_loss, 1)} dB"
     return {
         "README.md": [
+            f"Compact-3DGS gains {compact_gains} dB at 0.005", f"HAC changes by {hac_gains} dB",
             newest_span, f"keep their quality with {dense_plugged[1]} Gaussians",
             few, equal, f"{slower_fps['learned']} % slower", f"loses {span(authors, 1)} dB",
             f"bonsai loses {span(ablated, 1)} dB", f"Lego loses {-lego[-1]:.2f} dB",
@@ -437,6 +505,9 @@ def sentences() -> Dict[str, List[str]]:
             f"{span(faster['fastergs'], 1)} times as fast as Faster-GS",
             f"{span(faster['gsplat unpacked'], 1)} times as fast as gsplat"],
         "benchmarks/RESULTS.md": [
+            f"gains {compact_gains} dB with {compact_more} % more Gaussians and {compact_smaller} % smaller files",
+            f"changes by {hac_gains} dB", f"{span(equal_gains, 2, '+')} dB at equal size",
+            f"{-min(equal_sizes):.0f} % smaller to {max(equal_sizes):.0f} % larger at equal PSNR",
             "-{:.1f} dB on bonsai, -{:.1f} on fox, ".format(*newest_loss)
             + f"with {span(fewer(smoe, alpha) for alpha, smoe in newest)} % fewer",
             levels_sentence(), f"{sparse_plugged[0]} with {sparse_plugged[1]}",
@@ -464,6 +535,7 @@ def sentences() -> Dict[str, List[str]]:
             f"{large['start_gaussians'] / 1e6:.2f} million Gaussians to {large['budget']:,} took "
             f"{large['peak_reserved_bytes'] / 1e9:.1f} GB of GPU memory"],
         "docs/paper.md": [
+            f"gains {compact_gains} dB", f"HAC changes by {hac_gains} dB",
             newest_span, "edges gain {:.2f} where pictures gain {:.2f} dB on fox, ".format(*edges["fox"])
             + "{:.2f} for {:.2f} on room35".format(*edges["room35"]),
             few.replace("fewer Gaussians ", ""), f"{-ablated[2]:.1f} and {-ablated[3]:.1f} dB against Eq. 7",
@@ -517,7 +589,7 @@ def main() -> None:
     parser.add_argument("--figure", metavar="PNG", help="draw it here")
     options = parser.parse_args()
     rows = trainings()
-    for text in (first_table(), budget_table(rows), recipe_table(), table_1(),
+    for text in (first_table(), budget_table(rows), recipe_table(), table_1(), table_2(),
                  time_table(), transmittance_table(),
                  rules_table(), race_table(), presets_table(), simplify_table(),
                  *(f"{page}: {text}" for page, texts in sentences().items() for text in texts)):

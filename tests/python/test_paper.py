@@ -135,6 +135,18 @@ def test_a_number_at_a_psnr_is_interpolated_in_its_logarithm():
     assert tables.number_at([(100, 20.0), (400, 30.0)], 31.0) is None
 
 
+def test_trainers_are_compared_where_their_sizes_and_their_quality_overlap(monkeypatch):
+    """alpha has 10 dB for each factor of 10, from 1 to 100 MB; smoe lies 2 dB higher, from 10 to 1,000 MB."""
+    def row(size, psnr):
+        return {"size_bytes": {"own": size * 1e6}, "psnr": psnr}
+
+    rules = {"sparse": {"alpha": row(1, 20.0), "learned": row(10, 32.0)},
+             "dense": {"alpha": row(100, 40.0), "learned": row(1000, 52.0)}}
+    monkeypatch.setattr(tables, "plugged_rows", lambda: {("hac", end): found for end, found in rules.items()})
+    gains, sizes = tables.equal_size("hac", "learned")
+    assert gains == pytest.approx([2, 2]) and sizes == pytest.approx([100 * (10**-0.2 - 1)] * 2)
+
+
 @pytest.mark.slow
 def test_the_edge_has_the_figures_of_the_pages(tmp_path):
     """README and docs/paper.md, within what another processor may round otherwise in 600 steps."""
