@@ -180,6 +180,9 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 
 def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
     """Says what to do with a checkout that no patch fits."""
+    scripts = _training_scripts(files)
+    if scripts and all("/" in name for name in scripts):
+        return f"name the folder of the script that you run, such as {scripts[0].rpartition('/')[0]}"
     if not facts.calls_some(found) and not facts.importers(files):
         return ("name the folder in which train.py lies; a script of any other folder is run by "
                 "`dsmoe run --blend-mode smoe -- python SCRIPT ...`")
@@ -193,7 +196,13 @@ def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
 
 def _script_of(files: Mapping[str, bytes]) -> str:
     trains = [name for name, data in files.items() if b"def training(" in data and b"__main__" in data]
-    return min(trains or ["train.py"], key=lambda name: (name.count("/"), name != "train.py", name))
+    trains = trains or _training_scripts(files) or ["train.py"]
+    return min(trains, key=lambda name: (name.count("/"), name != "train.py", name))
+
+
+def _training_scripts(files: Mapping[str, bytes]) -> List[str]:
+    """Scripts that say by their name that they train."""
+    return [name for name, data in files.items() if "train" in name.rpartition("/")[2] and b"__main__" in data]
 
 
 def _by_run(files: Mapping[str, bytes]) -> str:
