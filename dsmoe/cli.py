@@ -244,6 +244,10 @@ def _simplify(arguments: argparse.Namespace) -> None:
     print(results_table([row["start"], row]))
     if row["protocol"]["scene_kind"] == "model":
         print("measured against renderings of the model: there are no photographs")
+    if row["psnr"] is None and row["psnr_train"] is not None:
+        before = row["start"].get("psnr_train")
+        print(f"the training views have {row['psnr_train']:.2f} dB"
+              + ("" if before is None else f", and {before:.2f} dB before"))
     if viewer_warning(row):
         print(viewer_warning(row))
     path = model_path(arguments.output, row["protocol"]["iterations"])

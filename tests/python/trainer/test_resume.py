@@ -329,7 +329,8 @@ def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, mon
 
 def test_other_options_cannot_be_resumed(tiny_config):
     train(tiny_config, progress=False)
-    with pytest.raises(TrainerError, match=r"--seed is 0, not 1\. `--resume -o .*/out` alone keeps the run's options"):
+    words = r"--seed is 0, not 1\. `dsmoe train --resume -o .*/out` keeps the run's options"
+    with pytest.raises(TrainerError, match=words):
         train(dataclasses.replace(tiny_config, seed=1), resume=True, progress=False)
     with pytest.raises(TrainerError, match="--blend-mode"):
         train(tiny_config.changed(blend_mode="alpha"), resume=True, progress=False)

@@ -192,6 +192,7 @@ def test_without_photographs_a_model_is_its_own_teacher(run, tmp_path, capsys):
     assert (row["num_gaussians"], row["protocol"]["scene_kind"], row["protocol"]["test_views"]) == (40, "model", 1)
     said = capsys.readouterr().out
     assert "measured against renderings of the model" in said and "inf" not in said and row["start"]["psnr"] is None
+    assert "the scene that its folder names, /nowhere, is not there" in said
     assert main(["eval", output, "--device", "cpu"]) == 0, "what was trained on can be made again"
     assert main(["simplify", folder, "--loses", "1", "-o", str(tmp_path / "no")]) == 1
     assert "--loses compares with photographs" in capsys.readouterr().err and not (tmp_path / "no").exists()
@@ -215,6 +216,29 @@ def test_a_run_whose_scene_is_gone_is_its_own_teacher(run, tmp_path):
                 assert getattr(view.camera, name) == getattr(photograph.camera, name)
             assert np.allclose(view.camera.rotation, photograph.camera.rotation, atol=1e-12)
             assert np.allclose(view.camera.translation, photograph.camera.translation, atol=1e-12)
+
+
+def test_a_scene_without_its_photographs_leaves_the_models_renderings(run, tmp_path, capsys):
+    scene = str(tmp_path / "scene")
+    shutil.copytree(run.scene, scene)
+    shutil.rmtree(os.path.join(scene, "images"))
+    (tmp_path / "model").mkdir()
+    folder = model_folder(run, tmp_path / "model", f"Namespace(eval=False, source_path={scene!r})")
+    words = ["simplify", folder, "--budget", "40", "-o", str(tmp_path / "out"), "--iterations", "8", "--device", "cpu"]
+    assert main(words) == 1
+    text = capsys.readouterr().err
+    assert "no such folder of images" in text and f"--scene {folder} takes the model's renderings" in text
+    assert not (tmp_path / "out").exists() and main([*words, "--scene", folder]) == 0
+    said, row = capsys.readouterr().out, results_of(str(tmp_path / "out"))[0]
+    assert f"the training views have {row['psnr_train']:.2f} dB\n" in said and row["start"]["psnr"] is None
+
+
+def test_a_run_is_its_own_teacher_at_the_size_of_its_images_if_asked(run, tmp_path):
+    """Its cameras.json has those; dividing them again would be wrong."""
+    shutil.copytree(run.output, tmp_path / "run")
+    TrainConfig.load(run.output).changed(resolution=2, output=str(tmp_path / "run")).save(str(tmp_path / "run"))
+    row = simplify(str(tmp_path / "run"), str(tmp_path / "out"), scene=str(tmp_path / "run"), budget=40, **SHORT)
+    assert (row["protocol"]["scene_kind"], row["protocol"]["image_size"]) == ("model", [30, 22])
 
 
 def test_a_run_knows_how_its_scene_is_loaded_wherever_that_lies(run, tmp_path):
@@ -341,11 +365,24 @@ def test_the_fewest_that_lose_no_more(run, tmp_path, monkeypatch):
     assert tried[0] == begun, "a resumed search goes on where it was"
 
 
+def test_a_gain_on_the_training_views_is_said_as_one(run, tmp_path, monkeypatch):
+    count, said = results_of(run.output)[0]["num_gaussians"], []
+
+    def figures(renderer, views, device, passes):
+        psnr = 30.0 if renderer.model.num_gaussians == count else 31.25
+        return type("Measured", (), {"metrics": {"psnr": psnr, "ssim": 1.0}, "fps": None})
+
+    monkeypatch.setattr(module, "evaluate", figures)
+    simplify(run.output, str(tmp_path / "out"), loses=0.0, iterations=4, progress=False, say=said.append)
+    assert said[-1].endswith("31.25 dB on the training images, 1.25 dB more than the model")
+
+
 @pytest.mark.parametrize("options, words", [
     ({}, "give one of --budget N, --keep PART and --loses DB"),
     ({"budget": 5, "keep": 0.5}, "give one of"),
     ({"budget": 10**6}, "--budget is 1000000; it must be at most"),
     ({"budget": 3}, "--budget is 3; it must be at least 4"),
+    ({"budget": 0}, "--budget is 0; it must be at least 4"),
     ({"keep": 0.0}, "--keep is 0.0; it must be above 0 and at most 1"),
     ({"keep": 1.5}, "--keep is 1.5"),
     ({"loses": -1.0}, "--loses is -1.0; it must be at least 0"),
@@ -380,12 +417,56 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
             "clean.glb`") in fails(ply, *scene)
     io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]]))
     assert "does not show" in fails(ply, *scene) and "at least 15" in fails(ply, *scene)
+    assert "was its background white (--white-background)?" in fails(ply, *scene)
+    assert "was its background black (now it is white)?" in fails(ply, *scene, "--white-background")
+    (tmp_path / "model.ksplat").write_bytes(bytes(64))
+    assert "model.ksplat: it is none of .ply, .splat, .spz and .glb" in fails(str(tmp_path / "model.ksplat"), *scene)
+    packed = "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 1\n{packed}end_header\n"
+    (tmp_path / "packed.ply").write_bytes(header.encode() + bytes(16))
+    assert "it is compressed, as SuperSplat does" in fails(str(tmp_path / "packed.ply"), *scene)
     main(["simplify", ply, "--budget", "40", "-o", output])
     assert "neither photographs nor cameras are known; name its scene with --scene" in capsys.readouterr().err
     (tmp_path / "bare").mkdir()
     bare = model_folder(run, tmp_path / "bare", cameras=False)
     main(["simplify", bare, "--budget", "40", "-o", output])
     assert "neither photographs nor cameras are known" in capsys.readouterr().err and not os.path.exists(output)
+
+
+@pytest.mark.parametrize("kind, order", [("float", "little"), ("double", "little"), ("float", "big")])
+def test_a_ply_of_another_program_is_read_by_the_names_of_its_fields(run, tmp_path, kind, order):
+    """No normals, fields in another order, other fields between them, either byte order, either precision."""
+    stored = io.read_gaussians(ply_of(run))
+    count, coefficients = stored.shs.shape[:2]
+    columns = {f"rot_{i}": stored.rotations[:, i] for i in range(4)}
+    columns.update({f"f_rest_{channel * coefficients + k}": stored.shs[:, k, channel]  # channel by channel
+                    for channel in range(3) for k in range(coefficients)})
+    columns.update(label=np.arange(count), opacity=stored.opacity_logits[:, 0])
+    columns.update({f"scale_{i}": stored.log_scales[:, i] for i in range(3)})
+    columns.update({f"f_dc_{i}": stored.dc[:, 0, i] for i in range(3)})
+    columns.update(zip("zxy", stored.means3D[:, [2, 0, 1]].T))
+    path = tmp_path / "model.ply"
+    header = "".join(f"property {kind} {name}\n" for name in columns)
+    dtype = (">" if order == "big" else "<") + ("f8" if kind == "double" else "f4")
+    path.write_bytes(f"ply\nformat binary_{order}_endian 1.0\nelement vertex {count}\n{header}end_header\n".encode()
+                     + np.stack(list(columns.values()), axis=1).astype(dtype).tobytes())
+    start = read_start(str(path))
+    assert (start.blend_mode, start.gaussians.sh_degree) == ("alpha", 1)
+    for name in ("means3D", "dc", "shs", "opacity_logits", "log_scales", "rotations"):
+        np.testing.assert_array_equal(getattr(start.gaussians, name), getattr(stored, name), err_msg=name)
+
+
+def test_a_model_trained_on_all_images_is_judged_by_these(run, tmp_path, capsys):
+    """As the recipe of 3DGS trains where nobody says --eval: then there is no test image."""
+    folder = model_folder(run, tmp_path, f"Namespace(eval=False, resolution=30, source_path={run.scene!r})")
+    output = str(tmp_path / "out")
+    assert main(["simplify", folder, "--keep", "1", "--iterations", "8", "-o", output, "--device", "cpu"]) == 0
+    row = results_of(output)[0]
+    scene = load_scene(run.changed(test_every=0), progress=False)
+    renderer = open_renderer(run, ply_of(run), None, "cpu")
+    before = evaluate(renderer, scene.train, "cpu", passes=1).metrics["psnr"]
+    assert row["psnr"] is None and row["start"]["psnr_train"] == pytest.approx(before, abs=1e-6)
+    assert f"the training views have {row['psnr_train']:.2f} dB, and {before:.2f} dB before" in capsys.readouterr().out
 
 
 def test_training_and_test_views_may_share_names(run, tmp_path):
