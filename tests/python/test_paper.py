@@ -126,7 +126,7 @@ def test_the_caption_of_the_edge_has_what_its_table_has():
 def test_what_the_pages_say_in_sentences_is_in_the_rows():
     for page, texts in tables.sentences().items():
         said = " ".join((ROOT / page).read_text(encoding="utf-8").split())
-        assert len(texts) > 3
+        assert len(texts) > 1
         assert not [text for text in texts if text not in said], f"{page}: see `python benchmarks/tables.py`"
 
 
