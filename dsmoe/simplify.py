@@ -188,7 +188,7 @@ def _fewest(measured: _Measured, budgets: List[int], loses: float, resume: bool,
 def _figures(measured: _Measured) -> Dict[str, Any]:
     """The model's own, for the row."""
     scene = measured.scene.to(measured.config.device)
-    evaluation: Evaluation = evaluate(measured.renderer, scene.test, measured.config.device, passes=1)
+    evaluation: Evaluation = evaluate(measured.renderer, scene.test, measured.config.device)
     metrics = {name: None if scene.kind == "model" else value for name, value in evaluation.metrics.items()}
     if not scene.test and scene.kind != "model":  # they alone tell what has changed
         metrics["psnr_train"] = evaluate(measured.renderer, scene.train, measured.config.device, passes=1

@@ -253,7 +253,21 @@ def check_start(scene: Scene, config: TrainConfig) -> Quality:
         [dataclasses.replace(view, camera=camera) for view, camera in zip(views, centred)]))
     if max(quality.psnr, quality.centred) < LEAST_PSNR:
         raise TrainerError(f"{start.path} does not show {config.scene}: {there:.1f} dB on its images, and it must be "
-                           f"at least {LEAST_PSNR:g}. Is it another scene, are its poses others than those of the "
-                           "training (some programs move and scale them), or was its background "
-                           + ("black (now it is white)?" if config.white_background else "white (--white-background)?"))
+                           f"at least {LEAST_PSNR:g}. {_why_not_shown(scene, config)}")
     return quality
+
+
+def _why_not_shown(scene: Scene, config: TrainConfig) -> str:
+    """Questions of what differs from the training of the model to start from."""
+    assert scene.start is not None
+    questions = ["is it another scene", "are its poses others than those of the training (some programs move and scale "
+                 "them)", "was its background "
+                 + ("black (now it is white)" if config.white_background else "white (--white-background)")]
+    if any(view.camera.lens for view in scene.train):
+        questions.append("were its images undistorted (--lenses undistort)")
+    elif scene.note:
+        questions.append("was it trained on images as they are (--lenses native)")
+    if scene.start.gaussians.blend_mode is None:
+        questions.append("is it of another blend than alpha, which the file does not record")
+    text = ", ".join(questions[:-1]) + ", or " + questions[-1]
+    return text[0].upper() + text[1:] + "?"

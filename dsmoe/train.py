@@ -13,7 +13,7 @@ from .options.config import CHECKPOINT_NAME, CONFIG_NAME, TrainConfig, holds_run
 from .results.modelfile import FOLDER, model_path, save_model
 from .results.pictures import loss_plot
 from .results.rendering import Rasterize
-from .results.rows import RESULTS_NAME, result_row, write_results
+from .results.rows import RESULTS_NAME, read_results, result_row, write_results
 from .results.scalars import FOLDER as SCALARS_FOLDER
 from .results.scalars import Scalars, scalar_files
 from .scenes.layout import Layout
@@ -135,7 +135,11 @@ class Run:
                          trainer.evaluate_training_views(self.progress), gate)
         if not trainer.leads:
             return row
-        write_results(os.path.dirname(self._path(RESULTS_NAME)), [row])
+        folder = os.path.dirname(self._path(RESULTS_NAME))
+        for earlier in read_results(folder) if config.init else ():  # of a resumed run
+            if "start" in earlier:  # of `dsmoe simplify`
+                row["start"] = earlier["start"]
+        write_results(folder, [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
         views = [*trainer.scene.test, *trainer.scene.train]
         write_json_atomically(self._path(CAMERAS), cameras_content([view.camera for view in views]))

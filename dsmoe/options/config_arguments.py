@@ -122,6 +122,8 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
         config = dataclasses.replace(config, **{name: getattr(earlier, name) for name in kept})
     elif chooses:
         dataclasses.replace(config, budget=config.budget or NUMBERS[config.device].least).validate()  # before it reads
+        from diff_smoe_rasterization.extension import BACKENDS  # noqa: F401  (says if nothing was built)
+
         from ..scenes.scene import read_layout
 
         layout = read_layout(config)

@@ -77,7 +77,9 @@ def read_ply(path: str) -> io.Gaussians:
         other = ("; it is compressed, as SuperSplat does: let that write a .ply that is not"
                  if "packed_position" in text else
                  "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
-                 if "no scalar property" in text else "")
+                 if "no scalar property" in text else
+                 "; `dsmoe simplify` and `dsmoe train --init` read such files, other commands a .ply"
+                 if path.lower().endswith((".splat", ".spz", ".glb")) else "")
         raise TrainerError(text + other) from error
 
 

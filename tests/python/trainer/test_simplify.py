@@ -27,9 +27,10 @@ from dsmoe.results.evaluation import evaluate
 from dsmoe.results.metrics import quantised
 from dsmoe.results.modelfile import load_model, model_path, raw_of
 from dsmoe.scenes.colmap import read_colmap_layout
+from dsmoe.scenes.lens import Lens
 from dsmoe.scenes.scene import load_scene, read_layout
 from dsmoe.simplify import simplify
-from dsmoe.starting import blend_options, find_model, read_start, start_renderer
+from dsmoe.starting import blend_options, check_start, find_model, read_start, start_renderer
 from dsmoe.train import train
 from dsmoe.training.forecast import Forecast
 from dsmoe.training.importance_strategy import ImportanceStrategy
@@ -343,7 +344,7 @@ def test_the_fewest_that_lose_no_more(run, tmp_path, monkeypatch):
         def __init__(self, number):
             self.metrics, self.fps = {"psnr": 30 - 10 * (1 - number / count), "ssim": 1.0}, None
 
-    def figures(renderer, views, device, passes):
+    def figures(renderer, views, device, passes=5):
         return Measured(renderer.model.num_gaussians)
 
     def trained(config, *arguments, **options):
@@ -368,7 +369,7 @@ def test_the_fewest_that_lose_no_more(run, tmp_path, monkeypatch):
 def test_a_gain_on_the_training_views_is_said_as_one(run, tmp_path, monkeypatch):
     count, said = results_of(run.output)[0]["num_gaussians"], []
 
-    def figures(renderer, views, device, passes):
+    def figures(renderer, views, device, passes=5):
         psnr = 30.0 if renderer.model.num_gaussians == count else 31.25
         return type("Measured", (), {"metrics": {"psnr": psnr, "ssim": 1.0}, "fps": None})
 
@@ -416,15 +417,22 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
     assert (f"2 of its {len(logits):,} Gaussians have a number that is NaN or infinite; `dsmoe export MODEL -o "
             "clean.glb`") in fails(ply, *scene)
     io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]]))
-    assert "does not show" in fails(ply, *scene) and "at least 15" in fails(ply, *scene)
-    assert "was its background white (--white-background)?" in fails(ply, *scene)
+    said = fails(ply, *scene)
+    assert "does not show" in said and "at least 15. Is it another scene, are its poses" in said
+    assert said.endswith(", or was its background white (--white-background)?\n")
     assert "was its background black (now it is white)?" in fails(ply, *scene, "--white-background")
+    io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]], blend_mode=None,
+                                                comments=()))
+    assert fails(ply, *scene).endswith(", or is it of another blend than alpha, which the file does not record?\n")
     (tmp_path / "model.ksplat").write_bytes(bytes(64))
     assert "model.ksplat: it is none of .ply, .splat, .spz and .glb" in fails(str(tmp_path / "model.ksplat"), *scene)
     packed = "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex 1\n{packed}end_header\n"
     (tmp_path / "packed.ply").write_bytes(header.encode() + bytes(16))
     assert "it is compressed, as SuperSplat does" in fails(str(tmp_path / "packed.ply"), *scene)
+    (tmp_path / "m.glb").write_bytes(b"glTF")
+    assert main(["export", str(tmp_path / "m.glb"), "-o", output + ".ply"]) == 1
+    assert "other commands a .ply" in capsys.readouterr().err
     main(["simplify", ply, "--budget", "40", "-o", output])
     assert "neither photographs nor cameras are known; name its scene with --scene" in capsys.readouterr().err
     (tmp_path / "bare").mkdir()
@@ -467,6 +475,20 @@ def test_a_model_trained_on_all_images_is_judged_by_these(run, tmp_path, capsys)
     before = evaluate(renderer, scene.train, "cpu", passes=1).metrics["psnr"]
     assert row["psnr"] is None and row["start"]["psnr_train"] == pytest.approx(before, abs=1e-6)
     assert f"the training views have {row['psnr_train']:.2f} dB, and {before:.2f} dB before" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("lens, note, question", [
+    (True, "", "were its images undistorted (--lenses undistort)"),
+    (False, "8 images are undistorted", "was it trained on images as they are (--lenses native)")])
+def test_another_lens_is_asked_for(run, lens, note, question):
+    config = run.changed(init=ply_of(run))
+    scene = load_scene(config, progress=False)
+    bent = Lens("OPENCV_FISHEYE", True, (0.0,) * 4) if lens else None
+    black = [dataclasses.replace(view, image=255 - view.image, camera=dataclasses.replace(view.camera, lens=bent))
+             for view in scene.train]
+    with pytest.raises(TrainerError) as error:
+        check_start(dataclasses.replace(scene, train=black, note=note), config)
+    assert question in str(error.value)
 
 
 def test_training_and_test_views_may_share_names(run, tmp_path):
@@ -521,7 +543,9 @@ def test_ctrl_c_keeps_the_model_and_resume_ends_where_it_would_have(run, tmp_pat
     assert 40 < len(io.read_gaussians(tmp_path / "sofar.ply").means3D), "the checkpoint's"
     assert main([*words, "-o", broken, "--resume"]) == 0
     assert open(model_path(broken, 40), "rb").read() == open(model_path(straight, 40), "rb").read()
-    assert "start" in results_of(broken)[0]
+    start = results_of(broken)[0]["start"]
+    assert main(["train", "--resume", "-o", broken, "--iterations", "44", "--quiet"]) == 0
+    assert results_of(broken)[0]["start"] == start and results_of(broken)[0]["protocol"]["iterations"] == 44
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
