@@ -6,7 +6,7 @@ from typing import Any, Optional, Sequence
 
 import torch
 
-from .settings import GaussianRasterizationSettings, resolve_blend_mode, resolve_lens
+from .settings import GaussianRasterizationSettings, numbers_of, resolve_blend_mode, resolve_lens
 
 # Clip range of the projection matrix. Nothing reads clip z (culling uses view depth), so it only has to be finite.
 CLIP_NEAR = 0.01
@@ -42,6 +42,10 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
         if K is not None:
             raise ValueError("settings_from_camera: K is given; an equirectangular camera has none, so it must be None")
         K = [[width / (2 * math.pi), 0, width / 2], [0, height / math.pi, height / 2], [0, 0, 1]]
+    elif K is None:
+        raise ValueError("settings_from_camera: K is None; only an equirectangular camera has none")
+    elif camera_model != "pinhole" and getattr(K, "requires_grad", False):
+        raise ValueError("settings_from_camera: K requires a gradient, but a lens has none; detach it")
     device = R.device if isinstance(R, torch.Tensor) else "cpu"  # computed there: elsewhere to check values would wait
     K, R, t = (torch.as_tensor(value, dtype=torch.float64, device=device) for value in (K, R, t))
     for name, value, shape in (("K", K, [3, 3]), ("R", R, [3, 3]), ("t", t, [3])):
@@ -63,7 +67,7 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
     settings = GaussianRasterizationSettings(
         image_height=height, image_width=width, tanfovx=width / (2 * fx), tanfovy=height / (2 * fy), bg=bg,
         scale_modifier=scale_modifier, viewmatrix=view, projmatrix=projection, sh_degree=sh_degree, campos=center,
-        camera_model=camera_model, distortion=tuple(distortion),
+        camera_model=camera_model, distortion=tuple(numbers_of("distortion", distortion)),
         principal_point=None if camera_model == "pinhole" else (rows[0][2], rows[1][2]), **options)
     resolve_lens(settings)
     return settings

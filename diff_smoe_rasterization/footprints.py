@@ -77,8 +77,10 @@ class Footprints(NamedTuple):
         """Those of an equirectangular image of this width, and the footprints that cross its seam on both sides of it.
 
         The second copy of a footprint follows the others, moved by the width. Radii count 3 sigma: what lies beyond is
-        still cut. The host waits for the number of copies.
+        still cut. The host waits for the number of copies. Raises ValueError for a width below 1.
         """
+        if width < 1:
+            raise ValueError(f"around: width is {width}; it must be that of the equirectangular image, 1 or more")
         left = ((self.radii > 0) & (self.gates[:, 0] < self.radii)).nonzero().squeeze(1)
         right = ((self.radii > 0) & (self.gates[:, 0] > width - 1 - self.radii)).nonzero().squeeze(1)
         parts = [self]

@@ -275,15 +275,24 @@ def resolve_lens(settings: GaussianRasterizationSettings) -> Tuple[int, List[flo
         raise ValueError(f"camera_model is {model!r}; it must be one of {', '.join(CAMERA_MODELS)}")
     if principal_point is None:
         principal_point = (settings.image_width / 2, settings.image_height / 2)
-    numbers = []
-    for name, values in (("principal_point", principal_point), ("distortion", distortion)):
-        try:
-            numbers.append([float(value) for value in values])
-        except (TypeError, ValueError, RuntimeError):
-            raise ValueError(f"{name} is {values!r}; it must be a sequence of numbers") from None
-    if len(numbers[0]) != 2:
+    point = numbers_of("principal_point", principal_point)
+    if len(point) != 2:
         raise ValueError(f"principal_point is {principal_point!r}; it must be two numbers")
-    return CAMERA_MODELS.index(model), [*numbers[0], *numbers[1]]
+    return CAMERA_MODELS.index(model), [*point, *numbers_of("distortion", distortion)]
+
+
+def numbers_of(name: str, values: Any) -> List[float]:
+    """Returns numbers of a lens. Raises ValueError for what are none, and for tensors that require a gradient."""
+    try:
+        if isinstance(values, str):
+            raise TypeError
+        needs_gradient = any(getattr(value, "requires_grad", False) for value in values)
+        numbers = [float(value) for value in values] if not needs_gradient else []
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{name} is {values!r}; it must be a sequence of numbers") from None
+    if needs_gradient:
+        raise ValueError(f"{name} requires a gradient, but a lens has none; detach it")
+    return numbers
 
 
 def _gated_names() -> str:

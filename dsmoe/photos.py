@@ -38,6 +38,7 @@ ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
 MIN_PHOTOS = 3
 POLL_SECONDS = 0.5
+FISHEYE_FOCAL = 0.4  # of the longer side, where a photograph records none: 143 degrees. COLMAP's 1.2 are 48
 FOCAL_LENGTH, EXIF = 37386, 0x8769  # tags
 ADVICE = ("Neighbouring photographs should show two thirds of the same things, sharply, with texture, from places that "
           "differ: walk around, do not only turn the camera. ")
@@ -177,6 +178,8 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
     one_camera = _are_of_one_camera(photos, names)
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
+    if "FISHEYE" in camera_model:
+        reader.default_focal_length_factor = FISHEYE_FOCAL
     mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
     say(f"finding features in {count} photographs of {'one camera' if one_camera else 'several cameras'}, on the "
         f"{'GPU' if pycolmap.has_cuda else 'CPU'}")

@@ -25,13 +25,16 @@ def load(path):
     return arguments, {**blend, "sh_degree": stored.sh_degree}
 
 
-def look_at(eye, target, width=400, height=300, up=(0.0, 1.0, 0.0), **options):
-    """Settings of a camera at `eye` that sees `target` in its centre; options: further settings."""
+def look_at(eye, target, width=400, height=300, up=(0.0, 1.0, 0.0), focal=400, **options):
+    """Settings of a camera at `eye` that sees `target` in its centre; options: further settings.
+
+    focal: pixels; None for a lens that has no focal length.
+    """
     eye, target, up = (torch.tensor(value, dtype=torch.float64) for value in (eye, target, up))
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])  # x right, y down, z forward
-    K = [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]
+    K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]] if focal else None
     return settings_from_camera(K, rotation, -rotation @ eye, width, height, **options)
 
 

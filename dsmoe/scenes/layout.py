@@ -77,19 +77,24 @@ def without_missing(folder: str, layout: Layout, strict: bool) -> Layout:
     return dataclasses.replace(layout, train=train, test=test, missing=[image.camera.name for image in missing])
 
 
-def with_lenses(folder: str, layout: Layout) -> Layout:
-    """The layout with each image's lens in its camera, so that nothing is to be undistorted. Raises SceneError."""
-    def native(image: PosedImage) -> PosedImage:
-        if not image.lens:
-            return image
+def check_lenses(folder: str, layout: Layout) -> None:
+    """Raises SceneError for a lens that cannot be that of its image."""
+    for image in [*layout.train, *layout.test]:
+        camera = image.camera
         try:
-            image.lens.check(max(image.camera.fx, image.camera.fy), image.camera.width, image.camera.height)
+            if image.lens:
+                image.lens.check(max(camera.fx, camera.fy), camera.width, camera.height)
         except ValueError as error:
-            raise SceneError(f"scene {folder}: {image.camera.name}: {error}") from error
+            raise SceneError(f"scene {folder}: {camera.name}: {error}") from error
+
+
+def with_lenses(layout: Layout) -> Layout:
+    """The layout with each image's lens in its camera, so that nothing is to be undistorted."""
+    def native(image: PosedImage) -> PosedImage:
         return dataclasses.replace(image, camera=dataclasses.replace(image.camera, lens=image.lens), lens=None)
 
-    return dataclasses.replace(layout, train=[native(image) for image in layout.train],
-                               test=[native(image) for image in layout.test])
+    return dataclasses.replace(layout, train=[native(image) if image.lens else image for image in layout.train],
+                               test=[native(image) if image.lens else image for image in layout.test])
 
 
 def with_masks(folder: str, layout: Layout) -> Layout:

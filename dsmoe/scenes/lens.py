@@ -33,6 +33,7 @@ FISHEYE = ("k1", "k2", "k3", "k4")
 COUNTS = {"opencv": (0, 1, 2, 4, 5, 8, 12), "fisheye": (0, 1, 2, 4), "thin_prism_fisheye": (0, 8),
           "equirectangular": (0,)}
 MAX_ASPECT_ERROR = 0.02  # of an image of all directions
+LEAST_REACH = 0.1  # of the shorter side: what a lens shows around its principal point
 SAMPLES = 4096  # of the distortion along a radius
 MOST_SLOPE, FISHEYE_END = 1e3, 0.97 * math.pi  # as the rasterizer has them: there a lens ends that does not before
 
@@ -57,7 +58,7 @@ class Lens:
         return math.inf if self.model == AROUND else float(self.radii[1][-1])
 
     def check(self, focal: float, width: int, height: int) -> None:
-        """Raises ValueError for a lens that cannot be of such images; the rasterizer does not know their names.
+        """Raises ValueError for a lens that cannot be that of such images.
 
         focal: the longer focal length, pixels.
         """
@@ -65,9 +66,9 @@ class Lens:
         if len(numbers) not in counts or not np.isfinite(numbers).all():
             raise ValueError(f"the distortion of a lens {self.camera_model} is {numbers}; it must be "
                              f"{' or '.join(map(str, counts))} finite numbers")
-        if not self.reach * focal >= 1:
+        if not self.reach * focal >= LEAST_REACH * min(width, height):
             raise ValueError(f"the lens folds the image back at {self.reach * focal:.2g} pixels from the principal "
-                             f"point, so that it shows nothing; its distortion is {numbers}")
+                             f"point, and shows nothing beyond; its distortion is {numbers}")
         if self.model == AROUND and abs(width / (2 * height) - 1) > MAX_ASPECT_ERROR:
             raise ValueError(f"an image of all directions must be twice as wide as it is high, and is {width}x{height}")
 

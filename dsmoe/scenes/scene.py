@@ -23,7 +23,7 @@ from ..system.process import command
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import MAX_WIDTH, View, fitted_camera, load_views, shown_by_lens, size_of_image
-from .layout import Layout, PosedImage, with_lenses, with_masks, without_missing
+from .layout import Layout, PosedImage, check_lenses, with_lenses, with_masks, without_missing
 from .modelfolder import CAMERAS, read_model_layout, rendered_views
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
@@ -112,7 +112,8 @@ def read_layout(config: TrainConfig) -> Layout:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split}); "
                          "--test-every 0 keeps none for testing")
     layout = with_masks(folder, _checked(folder, layout))
-    return with_lenses(folder, layout) if trains_natively(layout, config.lenses) else layout
+    check_lenses(folder, layout)
+    return with_lenses(layout) if trains_natively(layout, config.lenses) else layout
 
 
 def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:

@@ -139,3 +139,14 @@ def run_cell(source, variables):
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     exec(compile(tree, "cell", "exec"), variables)
     return None if last is None else eval(compile(ast.Expression(last.value), "cell", "eval"), variables)
+
+
+def test_one_place_through_five_lenses(model, tmp_path):
+    """All look at one point, which lies in the middle of each panel."""
+    run("lenses.py", model[0], "-o", "lenses.png", folder=tmp_path)
+    sheet = np.asarray(Image.open(tmp_path / "lenses.png")).astype(float)
+    assert sheet.shape == (499, 796, 3)
+    panels = [sheet[22:217, left:left + 260] for left in (0, 268, 536)] + [sheet[239:499, :260], sheet[239:499, 268:]]
+    middles = [panel[len(panel) // 2 - 1:, panel.shape[1] // 2 - 1:][:3, :3].mean((0, 1)) for panel in panels]
+    assert np.abs(middles - middles[0]).max() < 30, "levels of 255"
+    assert all(np.abs(panel - panels[0]).mean() > 5 for panel in panels[1:3]) and panels[4].std() > 10

@@ -224,11 +224,14 @@ def test_pixels_beyond_a_native_lens_are_masked(tmp_path):
 
 @pytest.mark.parametrize("model, params, words", [
     ("RADIAL", [FX, CX, CY, -1e5, 0.0], r"1.png: the lens folds the image back at 0.0\d+ pixels .* \[-100000.0, "),
+    # r (1 - 45 r^2) ends at 2/3 sqrt(1 / 135) = 0.057, of 70 pixels 4.0: less than a tenth of 72
+    ("RADIAL", [FX, CX, CY, -45.0, 0.0], "1.png: the lens folds the image back at 4 pixels"),
     ("EQUIRECTANGULAR", [WIDTH, HEIGHT], "1.png: an image of all directions must be twice as wide .* is 96x72")])
 def test_impossible_lenses_are_named_with_their_image(tmp_path, model, params, words):
     folder = write_scene(tmp_path, model, params, Image.new("RGB", (WIDTH, HEIGHT)))
-    with pytest.raises(SceneError, match=words):
-        load(folder, "native")
+    for lenses in ("native", "undistort", "auto"):
+        with pytest.raises(SceneError, match=words):
+            load(folder, lenses)
 
 
 @pytest.mark.parametrize("fields, words", [

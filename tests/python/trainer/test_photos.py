@@ -55,7 +55,7 @@ def test_photographs_of_bonsai_find_their_places(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "10 photographs of one camera" in text and "comparing all 45 pairs" in text
     assert "\n10 of 10 photographs are placed; " in text and "mean reprojection error 0." in text
-    assert text.splitlines()[-1].endswith(f"train {scene} -o MODEL --iterations 3000 --scale-recipe --resolution 2")
+    assert text.splitlines()[-1].endswith(f"train {scene} -o MODEL --fast --resolution 2")
     given, found = poses_of(bonsai), {name[len("walk/"):]: pose for name, pose in poses_of(str(scene)).items()}
     assert sorted(found) == names
     theirs, ours = (np.stack([poses[name][1] for name in names]) for poses in (given, found))
