@@ -346,16 +346,13 @@ template <class Frame> void refuse_walk(const char* function, const Frame& frame
   refuse_null(function, "images.radii", frame.images.radii, "[N]", reads_radii ? count : 0);
 }
 
-template <class Frame, class S>
-void refuse_contributions(const char* function, const Frame& frame, const ContributionMap<S>& map) {
-  const int64_t count = frame.inputs.num_gaussians;
+// pass: of dsmoe/passes.
+template <class Frame, class Pass> void refuse_pass(const char* function, const Frame& frame, const Pass& pass) {
   refuse_walk(function, frame);
-  refuse_instance_sums(function, frame);
-  refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
-  refuse_null(function, "sums.pixel_weights", map.sums.pixel_weights, "[N]", count);
-  refuse_null(function, "sums.pixels", map.sums.pixels, "[N]", count);
-  refuse_null(function, "sums.blend_weights", map.sums.blend_weights, "[N]", count);
-  refuse_null(function, "sums.distances", map.sums.distances, "[N]", count);
+  if (Pass::template Sums<float>::kNum > 0) refuse_instance_sums(function, frame);
+  pass.arrays([&](const char* name, const void* array, const char* shape,
+                  int64_t size) { refuse_null(function, name, array, shape, size); },
+              frame.inputs.num_gaussians);
 }
 
 // A mode without a removal cost.
@@ -367,31 +364,13 @@ template <class Modes = BlendModes> void refuse_unremovable(const char* function
   });
 }
 
-template <class Frame, class S>
-void refuse_importance(const char* function, const Frame& frame, const ImportanceMap<S>& map) {
-  const int64_t count = frame.inputs.num_gaussians;
-  refuse_walk(function, frame);
+template <class Frame, class Pass> void refuse_importance(const char* function, const Frame& frame, const Pass& pass) {
   refuse_unremovable(function, frame.config.blend.mode);
-  refuse_instance_sums(function, frame);
+  refuse_pass(function, frame, pass);
   refuse_footprints(function, frame);
   refuse_null(function, "background", frame.config.background, "[C]", 1);
   refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", 1);
   refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", has_tails(frame.config.blend.mode));
-  refuse_null(function, "color", map.color, "[C, H, W]", 1);
-  refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
-  refuse_null(function, "share_weights", map.share_weights, "[H, W]", 1);
-  refuse_null(function, "sums.shares", map.sums.shares, "[N]", count);
-  refuse_null(function, "sums.squared_shares", map.sums.squared_shares, "[N]", count);
-  refuse_null(function, "sums.removal_costs", map.sums.removal_costs, "[N]", count);
-}
-
-template <class Frame> void refuse_gate_map(const char* function, const Frame& frame, const GateMap& map) {
-  refuse_walk(function, frame);
-  refuse_null(function, "gaussians", map.gaussians, "[H, W]", 1);
-  refuse_null(function, "counts", map.counts, "[H, W]", 1);
-  const bool median = map.medians != nullptr;
-  refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", median);
-  refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", median && has_tails(frame.config.blend.mode));
 }
 
 template <class Frame> void refuse_mark_visible(const char* function, const Frame& frame, const bool* visible) {

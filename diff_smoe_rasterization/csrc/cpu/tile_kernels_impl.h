@@ -9,9 +9,13 @@ namespace dsmoe {
 namespace cpu {
 namespace DSMOE_SIMD {
 
+template <class S, class... Passes> constexpr KernelsOfPasses<S, PassList<Passes...>> kernels_of(PassList<Passes...>) {
+  return {{static_cast<PassKernel<S, Passes>>(pass)}...};
+}
+
 // A constant expression: no code of this instruction set runs before it is known to be there.
 template <class S> constexpr TileKernels<S> kernels() {
-  return {forward<S>, backward<S>, pass<S, ContributionPass<S>>, importance<S>, pass<S, GateMapPass<S>>};
+  return {forward<S>, backward<S>, kernels_of<S>(AllPasses<S>())};
 }
 
 }  // namespace DSMOE_SIMD

@@ -68,15 +68,8 @@ struct CpuCore {
     cpu::mark_visible(frame, visible);
   }
 
-  template <class Frame, class Map> static void contributions(const Frame& frame, const Map& map, const Call&) {
-    cpu::contributions(frame, map);
-  }
-  template <class Frame, class Map> static void importance(const Frame& frame, const Map& map, const Call&) {
-    cpu::importance(frame, map);
-  }
-  template <class Frame, class Map> static void gate_map(const Frame& frame, const Map& map, const Call&) {
-    cpu::gate_map(frame, map);
-  }
+  // Calls a pass with what it takes behind its frame and its map.
+  template <class Pass> static void walk(const Call&, Pass pass) { pass(); }
 
   static void count_rows(const ViewBatch& batch) { cpu::count_rows(batch); }
   static void project_rows(const ViewBatch& batch) { cpu::project_rows(batch); }

@@ -61,10 +61,6 @@ struct CudaCore {
   }
   static cuda::Run run(const Call& call) { return run(call.options, call.times); }
 
-  static cuda::Work work(const Call& call) {
-    return {current_stream(), &call.memory, nullptr, call.options.deterministic};
-  }
-
   template <class Frame> static cuda::SavedSizes saved_sizes(const Frame& frame, const Options& options) {
     return cuda::saved_sizes(frame, run(options, nullptr));
   }
@@ -110,14 +106,9 @@ struct CudaCore {
     cuda::mark_visible(frame, visible, {current_stream()});
   }
 
-  template <class Frame, class Map> static void contributions(const Frame& frame, const Map& map, const Call& call) {
-    cuda::contributions(frame, map, work(call));
-  }
-  template <class Frame, class Map> static void importance(const Frame& frame, const Map& map, const Call& call) {
-    cuda::importance(frame, map, work(call));
-  }
-  template <class Frame, class Map> static void gate_map(const Frame& frame, const Map& map, const Call& call) {
-    cuda::gate_map(frame, map, work(call));
+  // Calls a pass with what it takes behind its frame and its map.
+  template <class Pass> static void walk(const Call& call, Pass pass) {
+    pass(cuda::Work{current_stream(), &call.memory, nullptr, call.options.deterministic});
   }
 
   static void count_rows(const ViewBatch& batch) { cuda::count_rows(batch, {current_stream()}); }

@@ -145,44 +145,6 @@ template <class S> struct ImageOutputs {
   S* gate_sum = nullptr;       // [H, W] the alpha image: W, or W / D in a mode with tails
 };
 
-// Sums over the pixels that blended a Gaussian, as passes/contributions.h says; written whole.
-template <class S> struct ContributionSums {
-  S* pixel_weights = nullptr;  // [N]
-  int32_t* pixels = nullptr;   // [N]
-  S* blend_weights = nullptr;  // [N]
-  S* distances = nullptr;      // [N] pixels
-};
-
-// From a map of the image to sums over the pixels of each Gaussian.
-template <class S> struct ContributionMap {
-  const S* pixel_weights = nullptr;  // [H, W]
-  ContributionSums<S> sums;
-};
-
-// Sums over the pixels of each Gaussian, as removal.h says; written whole.
-template <class S> struct ImportanceSums {
-  S* shares = nullptr;          // [N]
-  S* squared_shares = nullptr;  // [N]
-  S* removal_costs = nullptr;   // [N]
-};
-
-// From a rendering's image and maps over it to what each Gaussian is worth.
-template <class S> struct ImportanceMap {
-  const S* color = nullptr;          // [C, H, W] as it was rendered
-  const S* pixel_weights = nullptr;  // [H, W] of squared shares and removal costs
-  const S* share_weights = nullptr;  // [H, W] of shares
-  ImportanceSums<S> sums;
-};
-
-// Per pixel; all are written whole.
-struct GateMap {
-  int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 if none is
-  int32_t* counts = nullptr;     // [H, W] how many Gaussians the numerator has
-  // [H, W] the one with which the weights, in the order of the list, reach half of the denominator; -1 where none does.
-  // Or null
-  int32_t* medians = nullptr;
-};
-
 // Any of these may be null. Then that output was not used.
 template <class S> struct ImageGradients {
   const S* color = nullptr;          // [C, H, W]

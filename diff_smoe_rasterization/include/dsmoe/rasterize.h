@@ -26,6 +26,9 @@
 
 #include "dsmoe/allocator.h"
 #include "dsmoe/params.h"
+#include "dsmoe/passes/contributions.h"
+#include "dsmoe/passes/gate_map.h"
+#include "dsmoe/passes/importance.h"
 
 namespace dsmoe {
 namespace cpu {

@@ -28,6 +28,9 @@
 #include "dsmoe/depth_bits.h"
 #include "dsmoe/features.h"
 #include "dsmoe/params.h"
+#include "dsmoe/passes/contributions.h"
+#include "dsmoe/passes/gate_map.h"
+#include "dsmoe/passes/importance.h"
 
 using cudaStream_t = struct CUstream_st*;  // as in CUDA's own headers, which a caller need not have
 

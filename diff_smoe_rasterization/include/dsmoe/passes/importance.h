@@ -7,8 +7,32 @@
 
 namespace dsmoe {
 
+// Sums over the pixels of each Gaussian, as removal.h says; written whole.
+template <class S> struct ImportanceSums {
+  S* shares = nullptr;          // [N]
+  S* squared_shares = nullptr;  // [N]
+  S* removal_costs = nullptr;   // [N]
+};
+
+// From a rendering's image and maps over it to what each Gaussian is worth.
+template <class S> struct ImportanceMap {
+  const S* color = nullptr;          // [C, H, W] as it was rendered
+  const S* pixel_weights = nullptr;  // [H, W] of squared shares and removal costs
+  const S* share_weights = nullptr;  // [H, W] of shares
+  ImportanceSums<S> sums;
+};
+
 template <class S> struct ImportancePass {
   template <class Real> using Sums = Importance<Real>;
+
+  template <class Visit> void arrays(Visit visit, int64_t count) const {
+    visit("color", map.color, "[C, H, W]", 1);
+    visit("pixel_weights", map.pixel_weights, "[H, W]", 1);
+    visit("share_weights", map.share_weights, "[H, W]", 1);
+    visit("sums.shares", map.sums.shares, "[N]", count);
+    visit("sums.squared_shares", map.sums.squared_shares, "[N]", count);
+    visit("sums.removal_costs", map.sums.removal_costs, "[N]", count);
+  }
   SumTargets<S> targets() const { return {{map.sums.shares, map.sums.squared_shares, map.sums.removal_costs}, 3}; }
 
   ImportanceMap<S> map;
