@@ -7,7 +7,7 @@ import torch
 
 from .arguments import as_rendering, op_arguments, tensor_checks, without_batch
 from .autograd import rasterize_op, refuse_transforms
-from .settings import GaussianRasterizationSettings, Rendering, resolve_lens
+from .settings import GaussianRasterizationSettings, Rendering, resolve_lens, resolve_shutter
 from .splats import Splats
 
 
@@ -122,8 +122,11 @@ class GaussianRasterizer(torch.nn.Module):
         viewmatrix = without_batch(required("viewmatrix", self.raster_settings.viewmatrix), 2)
         refuse_transforms("markVisible", (positions, viewmatrix))
         model, _ = resolve_lens(self.raster_settings)
+        end = self.raster_settings.viewmatrix_end if resolve_shutter(self.raster_settings) > 0 else None
+        if end is not None:
+            end = without_batch(required("viewmatrix_end", end), 2)
         return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near),
-                                                              model)
+                                                              model, end)
 
     def forward(self, means3D: torch.Tensor, means2D: _Absent, opacities: torch.Tensor, shs: _Absent = None,
                 colors_precomp: _Absent = None, scales: _Absent = None, rotations: _Absent = None,

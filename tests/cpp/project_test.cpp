@@ -99,6 +99,72 @@ TEST(ProjectGaussian, BackwardIsTheDerivativeThroughEveryLens) {
   }
 }
 
+TEST(ProjectGaussian, BackwardIsTheDerivativeWithARollingShutter) {
+  for (const Lens<double>& lens : make_lenses(40, 30)) {
+    for (const Shutter shutter : kRolling) {
+      Scene<double> scene = single_gaussian();
+      scene.camera.lens = lens;
+      scene.config.antialiasing = true;
+      set_shutter(scene.camera, shutter);
+      if (shutter == Shutter::kBottomToTop) {
+        scene.scales.clear(), scene.rotations.clear();
+        scene.cov3D_precomp = {0.25, 0.05, -0.03, 0.1, 0.02, 0.2};
+      }
+      expect_backward_is_the_derivative(scene);
+    }
+  }
+}
+
+// With slopes clamped the Jacobian is not the derivative of the pixel, and beyond the image the pose stands still.
+TEST(ProjectGaussian, BackwardIsTheDerivativeBesideARollingImage) {
+  for (const double aside : {1.6, -2.6}) {
+    for (const Shutter shutter : {Shutter::kTopToBottom, Shutter::kLeftToRight}) {
+      Scene<double> scene = single_gaussian();
+      scene.camera.lens = make_lenses(40, 30)[1];
+      set_shutter(scene.camera, shutter);
+      scene.means3D[0] = aside, scene.scales = {1.5, 0.9, 0.8};
+      expect_backward_is_the_derivative(scene);
+    }
+  }
+}
+
+TEST(ProjectGaussian, ARollingShutterReadsEachRowByThePoseOfItsTime) {
+  Scene<double> scene = single_gaussian();
+  for (const Lens<double>& lens : make_lenses(40, 30)) {
+    for (const Shutter shutter : kRolling) {
+      scene.camera.lens = lens;
+      set_shutter(scene.camera, shutter);
+      const auto rolled = project(scene).gaussian;
+      const double place = shutter == Shutter::kTopToBottom   ? rolled.mean.y / 29
+                           : shutter == Shutter::kBottomToTop ? 1 - rolled.mean.y / 29
+                           : shutter == Shutter::kLeftToRight ? rolled.mean.x / 39
+                                                              : 1 - rolled.mean.x / 39;
+      ASSERT_GT(place, 0.1);
+      ASSERT_LT(place, 0.9);
+      Scene<double> still = scene;
+      still.camera.shutter = Shutter::kGlobal;
+      for (int k = 0; k < 16; ++k) still.camera.view[k] += place * (scene.camera.view_end[k] - scene.camera.view[k]);
+      const auto expected = project(still).gaussian;
+      EXPECT_NEAR(rolled.mean.x, expected.mean.x, 1e-11);
+      EXPECT_NEAR(rolled.mean.y, expected.mean.y, 1e-11);
+      EXPECT_NEAR(rolled.depth, expected.depth, 1e-12);
+      const double off = std::abs(rolled.conic.xx / expected.conic.xx - 1);
+      EXPECT_GT(off + std::abs(rolled.conic.yy / expected.conic.yy - 1), 1e-3) << "stretched with the shutter";
+    }
+  }
+}
+
+TEST(ProjectGaussian, WhatMovesWithTheShutterIsCulled) {
+  Scene<double> scene = single_gaussian();
+  scene.camera.lens = lens_of({LensModel::kOrthographic, 40, 30, 5, 5, 20, 15, {}});
+  set_shutter(scene.camera, Shutter::kTopToBottom);
+  std::copy_n(scene.camera.view, 16, scene.camera.view_end);
+  for (const auto& [share, seen] : std::vector<std::pair<double, bool>>{{-3, true}, {0.5, true}, {0.95, false}}) {
+    scene.camera.view_end[13] = scene.camera.view[13] + share * 29 / 5;
+    EXPECT_EQ(project(scene).radius > 0, seen) << share;
+  }
+}
+
 TEST(ProjectGaussian, BeyondTheRangeOfALensIsCulledAndNotFoldedBack) {
   Scene<double> scene = single_gaussian();
   const double* view = scene.camera.view;

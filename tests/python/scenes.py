@@ -16,9 +16,10 @@ from diff_smoe_rasterization.settings import (
     resolve_background_gate,
     resolve_faint_below,
     resolve_lens,
+    resolve_shutter,
 )
 
-CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
+CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos", "viewmatrix_end")
 BACKGROUND_GATES = {"eq7_gate": ("smoe_eq7", 0.05), "smoe_learned_gate": ("smoe", torch.tensor(0.25, device="cpu"))}
 """Further modes of the tests: a blend mode and its background gate, a number and a tensor."""
 with_gate = pytest.mark.parametrize("mode", BLEND_MODES + ("smoe_learned_gate",))
@@ -196,7 +197,7 @@ def op_arguments(scene, op="rasterize", **others):
     learned = isinstance(gate, torch.Tensor)
     camera_model, lens = resolve_lens(scene.settings)
     values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode), "camera_model": camera_model,
-              "lens": lens,
+              "lens": lens, "rolling_shutter": resolve_shutter(scene.settings),
               "faint_below": resolve_faint_below(mode, scene.settings.faint_below),
               **dict.fromkeys(FEATURE_OUTPUTS, True),
               "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,

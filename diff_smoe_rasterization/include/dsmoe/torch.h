@@ -64,6 +64,10 @@ struct GaussianRasterizationSettings {
   std::vector<double> distortion;        // as LensCalibration (lens.h) has it
   std::optional<std::array<double, 2>> principal_point;  // pixels; the centre of the first pixel is (0.5, 0.5). Absent:
                                                          // of the image. A pinhole's is in projmatrix
+  std::string rolling_shutter = "global";  // a name of kShutterNames (camera.h): the order of rows or columns. But for
+                                           // "global", viewmatrix is the pose at the first and viewmatrix_end that at
+                                           // the last, and a pinhole needs principal_point, as of any lens
+  at::Tensor viewmatrix_end;               // [4, 4] transposed; undefined with "global"
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.
