@@ -53,19 +53,18 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
     if not (fx > 0 and fy > 0 and [rows[0][1], rows[1][0], *rows[2]] == [0, 0, 0, 0, 1]):
         raise ValueError(f"settings_from_camera: K is {rows}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx "
                          "and fy above 0")
-    view_end = None
+    ends = []
     if end is not None:
         view_end, center_end = _pose("end: ", *end, device)
-        center = (center + center_end) / 2
-    view, projection, center, view_end = (
-        None if matrix is None else matrix.contiguous().to(bg.device, dtype)
-        for matrix in (view.T, (clip_matrix(K, width, height) @ view).T, center, None if end is None else view_end.T))
+        ends, center = [view_end.T], (center + center_end) / 2
+    view, projection, center, *ends = (matrix.contiguous().to(bg.device, dtype) for matrix in (
+        view.T, (clip_matrix(K, width, height) @ view).T, center, *ends))
     settings = GaussianRasterizationSettings(
         image_height=height, image_width=width, tanfovx=width / (2 * fx), tanfovy=height / (2 * fy), bg=bg,
         scale_modifier=scale_modifier, viewmatrix=view, projmatrix=projection, sh_degree=sh_degree, campos=center,
         camera_model=camera_model, distortion=tuple(distortion),
         principal_point=None if camera_model == "pinhole" and end is None else (rows[0][2], rows[1][2]),
-        rolling_shutter=rolling_shutter, viewmatrix_end=view_end, **options)
+        rolling_shutter=rolling_shutter, viewmatrix_end=ends[0] if ends else None, **options)
     resolve_shutter(settings)
     resolve_lens(settings)
     return settings

@@ -116,6 +116,15 @@ def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, princi
         campos=position.to(dtype), prefiltered=False, debug=False, blend_mode=blend_mode, **fields)
 
 
+def turned(view, angles, shift):
+    """Returns a view matrix, transposed, after a further turn around x, y and z and a shift, both in view space."""
+    x, y, z = angles
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64))
+    turn = turn.to(view)
+    return torch.cat([torch.cat([view[:3, :3] @ turn.T, (view[3:, :3] @ turn.T) + view.new_tensor([shift])]),
+                      view[:, 3:]], 1)
+
+
 def random_scene(mode, num_gaussians=120, width=50, height=37, seed=0, degree=2, channels=None, covariance="scales",
                  split_dc=False, scale=0.12, opacity=(0.02, 1.2), dtype=torch.float64, **camera):
     """Returns a scene of a random cloud in a box that is larger than the view, so that about a third is out of sight.

@@ -358,7 +358,8 @@ def every_call():
     image_gradients = {name: value for name, value in backward.items() if name.startswith("dL_d")}
     inputs = {name: backward[name] for name in ("inputs", "present")}
     belongs = [here and name not in ("bg", "background_gate") for name, here in zip(_core.inputs, inputs["present"])]
-    view = {"cameras": camera_tensors(scene.settings), "images": image_numbers(scene.settings), "depth": False, "inverse_depth": False}
+    cameras = camera_tensors(scene.settings)
+    view = {"cameras": cameras, "images": image_numbers(scene.settings), "depth": False, "inverse_depth": False}
     counted = {"radii": torch.zeros(1, 20, dtype=torch.int32), "offsets": torch.tensor([[0, 1]], dtype=torch.int32)}
     wide = torch.zeros(1, 4)
     depth = random_normal((20,), 1, torch.float32)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from comparison import assert_all_close, assert_close, one_thread, reference_gradients, threshold_margin
 from devices import on_the_cpu, random_normal
-from scenes import assert_not_empty, gradients, op_arguments, random_scene
+from scenes import assert_not_empty, gradients, op_arguments, random_scene, turned
 from test_camera_models import FLOAT32_MARGIN, FLOAT64_TOLERANCE, LENSES, exact_lens, lens_scene
 
 from diff_smoe_rasterization import (
@@ -28,15 +28,6 @@ pytestmark = pytest.mark.usefixtures("device")
 MODELS = ("pinhole", *LENSES)
 EVERY_LENS = [(model, ROLLING_SHUTTERS[1 + k % 4]) for k, model in enumerate(MODELS)]
 """Every model with one of the shutters."""
-
-
-def turned(view, angles, shift):
-    """Returns a view matrix, transposed, after a further turn around x, y and z and a shift, both in view space."""
-    x, y, z = angles
-    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64))
-    turn = turn.to(view)
-    return torch.cat([torch.cat([view[:3, :3] @ turn.T, (view[3:, :3] @ turn.T) + view.new_tensor([shift])]),
-                      view[:, 3:]], 1)
 
 
 def rolling_scene(mode, model, shutter, covariance="scales", **options):

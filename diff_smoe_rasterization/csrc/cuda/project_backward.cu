@@ -7,6 +7,9 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
+// Whether a kernel for these cameras knows of rolling shutters.
+template <class AnyCamera, class S> constexpr bool kMayRoll = std::is_same_v<AnyCamera, Camera<S>>;
+
 // Numbers of the camera's gradient, of which the last 16 are those of a rolling shutter.
 constexpr int kCameraGradientSize = sizeof(CameraGradient<float>) / sizeof(float);
 static_assert(kCameraGradientSize == 51, "view, projection, position and view_end lie side by side");
@@ -41,9 +44,6 @@ __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, i
   if constexpr (kRolls) store_sums(dL_dcamera.view_end);
 }
 
-// Whether a kernel for these cameras knows of rolling shutters.
-template <class AnyCamera, class S> constexpr bool kMayRoll = std::is_same_v<AnyCamera, Camera<S>>;
-
 template <class S> __device__ GateGradient<S> gate_of_moments(const ProjectedGaussian<S>& projected, const S* record) {
   const GateMoments<S> moments = {record[0], record[1], record[2], record[3], record[4], record[5]};
   return moments_backward(projected.conic, projected.opacity, moments);
@@ -65,10 +65,16 @@ constexpr int kRecordLength = kNumGateMoments + kFastFeatures;  // of colours
 constexpr int kMostRecordLength = kRecordLength + kMostFurtherFeatures;
 using RecordRows = WarpRows<kRecordLength>;
 
+// Blocks of the common case that one multiprocessor holds at once.
+template <class AnyCamera, bool kCamera>
+constexpr int kKnownBackwardBlocks = kCamera                      ? kCameraBackwardBlocks
+                                     : kMayRoll<AnyCamera, float> ? kShutterBackwardBlocks
+                                                                  : kRowsBackwardBlocks;
+
 // The common case. The SH rows come through shared memory. So do the records if they are of colours only. All other
 // numbers live in registers.
 template <class AnyCamera, bool kCamera, bool kOnlyColors, class Rows>
-__global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : kRowsBackwardBlocks)
+__global__ void __launch_bounds__(kRowsBlock, kKnownBackwardBlocks<AnyCamera, kCamera>)
     known_backward_kernel(const __grid_constant__ ProjectBackwardArguments<float> arguments) {
   __shared__ AnyCamera camera;
   extern __shared__ float4 shared_rows[];
