@@ -22,8 +22,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
-        settings: camera and options. Its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
-            differentiable too, each on its own.
+        settings: camera and options. Its viewmatrix, viewmatrix_end, projmatrix, campos, bg and, as a tensor,
+            background_gate are differentiable too, each on its own.
         means2D: [N, 3]; only its gradient is used: dL/d(pixel) times (width / 2, height / 2), z = 0.
             Densification reads it.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.

@@ -12,7 +12,8 @@ What the paper leaves open is decided here:
   infinite, its opacity is above 1e20, its view depth is not beyond `near`, its projected covariance is not positive
   definite, its pixel position, conic or colour is not finite, or its footprint misses the image.
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
-- With a camera model other than "pinhole", a Gaussian beyond its lens's range is culled too: see `lens_points`.
+- With a camera model other than "pinhole", a Gaussian beyond its lens's range is culled too: see `lens_points`. With a
+  rolling shutter, so is one that moves about as fast as it: see `rolling_points`.
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `tail_sum`.
@@ -106,8 +107,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
-        settings: GaussianRasterizationSettings; viewmatrix, projmatrix, campos, bg and a tensor background_gate are
-            differentiable.
+        settings: GaussianRasterizationSettings; viewmatrix, viewmatrix_end, projmatrix, campos, bg and a tensor
+            background_gate are differentiable.
         means2D: [N, 3]; its gradient is dL/d(pixel) times (0.5 width, 0.5 height), z = 0.
         dc, shs: [N, 1, 3] and [N, K - 1, 3], or only shs [N, K, 3]; K >= (sh_degree + 1)^2.
         colors_precomp: [N, C] instead of dc and shs.

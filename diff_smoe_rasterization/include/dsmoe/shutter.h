@@ -16,7 +16,7 @@ constexpr double kFirstTime = 0.5 - 0.5 * kFrustumMargin, kLastTime = 0.5 + 0.5 
 // its height, four leave less than 1e-12 pixels.
 constexpr int kTimeSteps = 4;
 // A point is culled if it moves along with the shutter at more than 0.9 of its speed, or if its time is not found to
-// this many pixels: the shutter may see it twice, or never.
+// this many pixels of the readout and of its way: the shutter may see it twice, or never.
 constexpr double kLeastShutterSpeed = 0.1, kMostTimeError = 0.1;
 
 // Where on the image the time is: (dot(axis, pixel) - first) / length.
@@ -102,10 +102,10 @@ DSMOE_HD ShutterPoint<S> through_shutter(const Lens<S>& lens, const Readout<S>& 
   ShutterPoint<S> out;
   static_cast<LensPoint<S>&>(out) = through_lens(lens, of.view);
   const Mat23<S> j = out.still = out.jacobian;
-  const S time = (readout.along(out.pixel) - readout.first) / readout.length;
-  const S error = abs(clamp(time, S(kFirstTime), S(kLastTime)) - of.time) * readout.length;
-  out.seen = out.seen && error < S(kMostTimeError);
   out.velocity = {dot(j.r0, of.motion), dot(j.r1, of.motion)};
+  const S time = (readout.along(out.pixel) - readout.first) / readout.length;
+  const S error = abs(clamp(time, S(kFirstTime), S(kLastTime)) - of.time);
+  out.seen = out.seen && error * (readout.length + abs(out.velocity.x) + abs(out.velocity.y)) < S(kMostTimeError);
   out.inverse_speed = S(0);
   if (!of.moves) return out;
   const S speed = readout.length - readout.along(out.velocity);

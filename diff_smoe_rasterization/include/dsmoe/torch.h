@@ -141,7 +141,8 @@ std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, co
                                                    const RasterizeArguments& arguments = {});
 
 /// The settings of a camera, transposed matrices included, as Python's function of this name; for a lens other than a
-/// pinhole set camera_model, distortion and principal_point of the result. K: [3, 3]
+/// pinhole set camera_model, distortion and principal_point of the result, for a rolling shutter rolling_shutter,
+/// viewmatrix_end and principal_point. K: [3, 3]
 /// intrinsics in pixels; as in COLMAP, the centre of the top left pixel is (0.5, 0.5). R, t: [3, 3] and [3], world to
 /// view: x_view = R x_world + t, with x right, y down, z forward. bg: [C]; the matrices get its type and its device.
 /// They have gradients with respect to R, t and, in the projection, K.
