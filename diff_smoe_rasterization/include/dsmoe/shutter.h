@@ -13,7 +13,7 @@ namespace dsmoe {
 // Times end as far beyond the image as the slopes of a pinhole do. Beyond, the pose stands still.
 constexpr double kFirstTime = 0.5 - 0.5 * kFrustumMargin, kLastTime = 0.5 + 0.5 * kFrustumMargin;
 // Newton's steps to the time, from the middle of the image. Each doubles the digits. Where the image moves by 0.4 of
-// its height, four leave less than 1e-12 pixels.
+// its height, four leave less than 1e-11 pixels.
 constexpr int kTimeSteps = 4;
 // A point is culled if it moves along with the shutter at more than 0.9 of its speed, or if its time is not found to
 // this many pixels of the readout and of its way: the shutter may see it twice, or never.
