@@ -16,6 +16,7 @@ from .settings import (
     resolve_blend,
     resolve_faint_below,
     resolve_lens,
+    resolve_shutter,
 )
 
 
@@ -40,6 +41,8 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
     inputs["bg"] = required("bg", settings.bg)
     for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
         inputs[name] = without_batch(required(name, getattr(settings, name)), dim)
+    if settings.viewmatrix_end is not None:
+        inputs["viewmatrix_end"] = without_batch(required("viewmatrix_end", settings.viewmatrix_end), 2)
     return [inputs.get(name) for name in INPUTS], op_options(function, settings, outputs, blend_mode, fixed_gate)
 
 
@@ -58,8 +61,9 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
             if not fits(kind, value):
                 raise ValueError(f"{function}: {name} is {value!r}; it must be {KINDS[kind]}")
     faint_below = resolve_faint_below(blend_mode, settings.faint_below)
+    shutter = resolve_shutter(settings)
     model, lens = resolve_lens(settings)
-    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens,
+    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens, shutter,
                 *[name in outputs for name in FEATURE_OUTPUTS]]
     for place, value in zip(_COMPUTED_OPTIONS.values(), computed):
         options.insert(place, value)
@@ -84,7 +88,7 @@ _WHOLE_LIMIT = 2**63
 assert list(OPTIONS)[-1] == "for_backward"
 _COMPUTED_OPTIONS = {name: list(OPTIONS).index(name)
                      for name in ("faint_below", "fixed_background_gate", "blend_mode", "camera_model", "lens",
-                                  *FEATURE_OUTPUTS)}
+                                  "rolling_shutter", *FEATURE_OUTPUTS)}
 assert list(_COMPUTED_OPTIONS.values()) == sorted(_COMPUTED_OPTIONS.values())  # they are inserted in this order
 _SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
 _WHOLE_OPTIONS = [place for place, (_, kind) in enumerate(_SETTING_OPTIONS) if kind is int]

@@ -238,7 +238,7 @@ def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
     return _fake_gradients(inputs, present, others[-1])
 
 
-def _fake_mark_visible(positions, viewmatrix, near, camera_model=0):
+def _fake_mark_visible(positions, viewmatrix, near, camera_model=0, viewmatrix_end=None):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
 
 

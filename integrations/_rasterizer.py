@@ -230,6 +230,9 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
 
 def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torch.Tensor]) -> Settings:
     """Returns the settings with a camera that depends on theta and rho, at 0, to first order."""
+    if settings.rolling_shutter != "global":
+        raise NotImplementedError(f"rasterize: rolling_shutter is {settings.rolling_shutter!r}; theta and rho are "
+                                  "offered for 'global'")
     view = settings.viewmatrix  # transposed
     zero = view.new_zeros(3)
     x, y, z = (zero if theta is None else theta.reshape(3) - theta.reshape(3).detach()).unbind()

@@ -158,10 +158,22 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
     refuse_unless_positive(function, "camera.lens.focal.x", camera.lens.focal.x);
     refuse_unless_positive(function, "camera.lens.focal.y", camera.lens.focal.y);
   }
+  const int shutter = static_cast<int>(camera.shutter);
+  if (shutter < 0 || shutter >= kNumShutters) {
+    refuse(function, "camera.shutter (rolling_shutter) is ", shutter, "; it must be 0 to ", kNumShutters - 1);
+  }
+  const bool rolls = camera.shutter != Shutter::kGlobal;
+  if (rolls && pinhole) {
+    refuse(function, "camera.shutter is ", kShutterNames[shutter],
+           ", but camera.lens is a pinhole; it must be another lens, such as opencv without distortion");
+  }
   if constexpr (kOnHost<Frame>) {
     refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", camera.view);
     if (pinhole) {
       refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
+    }
+    if (rolls) {
+      refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view_end (viewmatrix_end)", camera.view_end);
     }
     const bool read = frame.inputs.dc != nullptr || frame.inputs.shs != nullptr;
     for (int i = 0; read && i < 3; ++i) refuse_unless_finite(function, "camera.position (campos)", camera.position, i);
@@ -169,6 +181,7 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
     refuse_null(function, "camera.view", camera.view, "[4, 4]", 1);
     refuse_null(function, "camera.projection", camera.projection, "[4, 4]", 1);
     refuse_null(function, "camera.position", camera.position, "[3]", 1);
+    if (rolls) refuse_null(function, "camera.view_end", camera.view_end, "[4, 4]", 1);
   }
 }
 

@@ -7,7 +7,7 @@ import torch
 
 from diff_smoe_rasterization.autograd import INPUTS
 from diff_smoe_rasterization.core import _core
-from diff_smoe_rasterization.footprints import GATE_NUMBERS, image_numbers, projection_arguments
+from diff_smoe_rasterization.footprints import GATE_NUMBERS, camera_tensors, image_numbers, projection_arguments
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -25,7 +25,7 @@ class ViewRows:
         for begin in range(0, len(settings), most):
             some = settings[begin:begin + most]
             inputs, options = projection_arguments(some[0], means3D, opacities, **tensors)
-            cameras = [tensor for each in some for tensor in (each.viewmatrix, each.projmatrix, each.campos)]
+            cameras = [tensor for each in some for tensor in camera_tensors(each)]
             images = [number for each in some for number in image_numbers(each)]
             self._arguments.append((*inputs, *options, True, cameras, images))
         self._present = [tensor is not None for tensor in inputs]

@@ -153,6 +153,8 @@ def test_the_page_of_settings_says_what_the_code_does(stage):
     scene.inputs["shs"] = torch.zeros(5, 16, 3, dtype=scene.inputs["means3D"].dtype)  # of all degrees
 
     def render(**changed):
+        if changed.get("rolling_shutter", "global") != "global":
+            changed.update(viewmatrix_end=scene.settings.viewmatrix, principal_point=(10.0, 9.0))
         rasterize(settings=scene.settings._replace(**changed), **scene.inputs)
 
     def train(**changed):

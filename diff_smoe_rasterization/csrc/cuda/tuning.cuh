@@ -109,6 +109,8 @@ constexpr int kRowsBlock = 128;
 // each thread 96 registers. With the camera's gradient, 35 more sums a thread would not fit them: the compiler decides.
 constexpr int kRowsBackwardBlocks = 5;
 constexpr int kCameraBackwardBlocks = 1;
+// With a rolling shutter 96 registers would spill some 300 bytes: 3 x 128 threads leave each thread 168.
+constexpr int kShutterBackwardBlocks = 3;
 // The same over the views of a batch, where the sums of 48 SH gradients stay in registers, but for some that spill:
 // 3 x 128 threads leave each thread 168.
 constexpr int kViewsBackwardBlocks = 3;

@@ -134,6 +134,8 @@ PYBIND11_MODULE(_core, module) {
   module.attr("blend_modes") = blend_modes();
   module.attr("camera_models") =
       py::tuple(py::cast(std::vector<std::string>(std::begin(kLensNames), std::end(kLensNames))));
+  module.attr("rolling_shutters") =
+      py::tuple(py::cast(std::vector<std::string>(std::begin(kShutterNames), std::end(kShutterNames))));
   module.attr("inputs") = inputs();
   module.attr("images") = images();
   module.attr("options") = options();

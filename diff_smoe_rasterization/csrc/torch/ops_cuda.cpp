@@ -46,6 +46,7 @@ struct CudaCore {
   static int64_t feature_columns(int64_t num_features) { return cuda::feature_stride(static_cast<int>(num_features)); }
   template <class Config> static void set_threads(Config&) {}
   template <class Camera, class S> static void set_view(Camera& camera, const S* view) { camera.view = view; }
+  template <class Camera, class S> static void set_view_end(Camera& camera, const S* view) { camera.view_end = view; }
   template <class Camera, class S>
   static void set_camera(Camera& camera, const S* view, const S* projection, const S* position) {
     camera.view = view, camera.projection = projection, camera.position = position;
