@@ -20,7 +20,7 @@ template <class S> struct PinholeCamera {
   S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
 
-// With a lens that is no pinhole, neither the tangents nor `projection` are read: all of the pose is in `view`.
+// With a lens other than a pinhole, neither the tangents nor `projection` are read: all of the pose is in `view`.
 template <class S> struct Camera : PinholeCamera<S> { Lens<S> lens; };
 
 // A calibrated pinhole camera. View axes are x right, y down, z forward. The centre of the top left pixel is
