@@ -98,8 +98,8 @@ def clip_matrix(K: torch.Tensor, width: int, height: int) -> torch.Tensor:
 
     Differentiable with respect to K, which is as in `settings_from_camera`.
     """
-    # The rasterizer puts NDC x at pixel index ((x + 1) width - 1) / 2, so that a point at fx X/Z + cx (COLMAP's
-    # coordinates, half a pixel above the index) needs x = 2 fx/width X/Z + 2 cx/width - 1; y likewise.
+    # The rasterizer puts NDC x at pixel index ((x + 1) width - 1) / 2. COLMAP's coordinates are half a pixel above the
+    # index: a point at fx X/Z + cx has x = 2 fx/width X/Z + 2 cx/width - 1; y likewise.
     image = torch.stack([2 * K[..., 0, :] / width, 2 * K[..., 1, :] / height], -2) - K.new_tensor([0.0, 0.0, 1.0])
     depth = CLIP_FAR / (CLIP_FAR - CLIP_NEAR)
     last = K.new_tensor([[0.0, 0.0, depth, -CLIP_NEAR * depth], [0.0, 0.0, 1.0, 0.0]])

@@ -56,7 +56,7 @@ class ProcessGate:
         self.reset()
 
     def reset(self, frozen: bool = False) -> None:
-        """Begins at START. frozen: it is that of a trained model, which `found` will say, and is never stepped."""
+        """Begins at START. frozen: the gate of a trained model; `found` sets it, nothing steps it."""
         self.frozen = frozen
         self.renders = False  # whether anything was rendered, with this gate or another
         self.blend_mode: Optional[str] = None  # of the last rendering with this gate; None: there was none

@@ -233,7 +233,7 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
     """Returns the gate sum of near pairs below which a rendering in this blend mode counts faint pairs and tails.
 
-    None means that of the process, else the environment variable DSMOE_FAINT_BELOW, for callers that cannot be edited,
+    None means the process's value, else the environment variable DSMOE_FAINT_BELOW, for callers that cannot be edited,
     else the mode's own.
     Raises ValueError for what is not a number of 0 or more, or a greater one than MAX_BACKGROUND_GATE.
     """
@@ -267,8 +267,8 @@ def resolve_lens(settings: GaussianRasterizationSettings) -> Tuple[int, List[flo
     """Returns the number of the camera model, and the principal point and distortion that the ops take.
 
     With a rolling shutter a pinhole is `opencv` without distortion. Raises ValueError for a name that is not in
-    CAMERA_MODELS, for what are no numbers, and for a pinhole that has or lacks them against its rule. The core refuses
-    wrong counts and values.
+    CAMERA_MODELS, for values that are not numbers, and for a pinhole that has or lacks them against its rule. The core
+    refuses wrong counts and values.
     """
     model, distortion, principal_point = settings.camera_model, settings.distortion, settings.principal_point
     if model == "pinhole" and settings.rolling_shutter != "global" and len(distortion) == 0:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 LEAST_PSNR = 15.0  # of a model on its scene, dB: with less they do not belong together
 CHECKED_VIEWS = 16
 LEAST_ABOVE_BOUND = 1e-3  # a learned gate begins above its bound
-CLEARLY = 0.1  # dB: the principal points of a model's program are seen by it
+CLEARLY = 0.1  # dB of difference that show where a model's program had the principal points
 READERS = {".splat": splat_gaussians, ".spz": spz_gaussians, ".glb": glb_gaussians}
 
 

@@ -274,14 +274,15 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
           layout: Optional[Layout] = None) -> Dict[str, Any]:
     """Trains a scene into config.output; returns the row of results.json.
 
-    resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
-    of threads and the same SIMD level); start it if it has no checkpoint yet. With more iterations than it had, it
-    is extended: its milestones stay, and if it had ended it lacks the update of its last step. overwrite: replace a
-    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, if one is at
-    hand. group: the processes that train together, if there are several; all of them call this. say: is called
-    with a line about what was loaded; with it a training on the CPU also says how long it takes. lock: the folder's, if
-    the caller keeps it over several runs. layout: what `read_layout` gave, if it is at hand. Raises TrainerError
-    before training starts if anything does not fit, such as another run at work in the folder.
+    resume: continue the run in config.output; start it if it has no checkpoint yet. The result is bit for bit as if
+        it had not stopped (on the CPU, with the same number of threads and the same SIMD level). With more
+        iterations than it had, it is extended: its milestones stay, and if it had ended it lacks its last update.
+    overwrite: replace a run that is there, once this one can start; files that no run wrote stay.
+    scene: a loaded scene, if one is at hand. layout: what `read_layout` gave, likewise.
+    group: the processes that train together, if there are several; all of them call this.
+    say: is called with a line about what was loaded; with it a training on the CPU also says how long it takes.
+    lock: the folder's, if the caller keeps it over several runs.
+    Raises TrainerError before training starts if anything does not fit, such as another run at work in the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")

@@ -1,7 +1,7 @@
 """Plans a patch, and makes it, shows it or takes it back. Everything is planned before anything is written.
 
-A plan is made of the files without what a patch put into them. So it is the same for a checkout that is patched, half
-patched by an interruption, or patched with other options, and to apply it is to write what differs from it.
+A plan is made of the files without what a patch put into them. So it is the same if the checkout is patched, half
+patched by an interruption, or patched with other options. To apply it is to write what differs from it.
 """
 from __future__ import annotations
 

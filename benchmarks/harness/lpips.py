@@ -99,7 +99,7 @@ class FileLpips:
 
 
 def arrays_of(path: str) -> Dict[str, np.ndarray]:
-    """The arrays of a file, lin as [channels]. Raises OSError; ValueError if it is no such file."""
+    """The arrays of a file, lin as [channels]. Raises OSError; ValueError if it holds others."""
     try:
         with np.load(path) as file:
             return {name: file[name].reshape(-1) if name.startswith("lin") else file[name] for name in file.files}

@@ -54,10 +54,10 @@ class ViewRows:
         return gates, features
 
     def backward(self, records: List[torch.Tensor]) -> Tuple[Dict[str, torch.Tensor], List[torch.Tensor]]:
-        """Gradients from those by the rows of each view, [M, 9].
+        """From gradients by the rows of each view, [M, 9], to those by the arguments.
 
-        Returns sums over the views in their order, by the names of the arguments, and of each view dL/dpixel times
-        (W / 2, H / 2), [N, 3], written where the radius is above 0.
+        Returns their sums over the views in order, by the arguments' names. And of each view dL/dpixel times (W / 2,
+        H / 2), [N, 3], written where the radius is above 0.
         """
         sums: Optional[List[torch.Tensor]] = None
         means2D: List[torch.Tensor] = []

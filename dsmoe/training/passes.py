@@ -52,7 +52,7 @@ def add_gradient(model: GaussianModel, name: str, number: float) -> None:
     value.backward(torch.full_like(value, number))
 
 
-@dataclass(repr=False)  # that of a ViewStep: it has no fields that `backward` deletes
+@dataclass(repr=False)  # a ViewStep's: `backward` deletes fields
 class AutogradStep(ViewStep):
     """A step of `AutogradPasses`."""
 

@@ -208,7 +208,7 @@ class Trainer:
         return self._evaluate(self.scene.test, progress, image_metrics, PASSES)
 
     def evaluate_training_views(self, progress: bool = False) -> Optional[float]:
-        """Their mean PSNR. Where it rises and that of the test views does not, a longer training only overfits."""
+        """Their mean PSNR. If it rises and the test views' does not, a longer training only overfits."""
         return self._evaluate(self.scene.train, progress, psnr_alone, 1).metrics["psnr"]
 
     def _evaluate(self, views: Sequence[View], progress: bool, measure: Measure, passes: int) -> Evaluation:

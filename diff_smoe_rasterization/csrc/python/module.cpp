@@ -58,7 +58,7 @@ py::dict options() {
   return types;
 }
 
-// What a backend saves: of each tensor its name, its type ("real": that of the inputs) and how many numbers a row has.
+// What a backend saves: of each tensor its name, its type ("real": the inputs' type) and how many numbers a row has.
 template <class Saved, class Sizes> py::list saved_arrays() {
   py::list arrays;
   Saved saved;

@@ -20,7 +20,7 @@ template <class S> struct PinholeCamera {
   S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
 
-// With a lens that is no pinhole, neither the tangents nor `projection` are read: all of the pose is in `view`.
+// With a lens other than a pinhole, neither the tangents nor `projection` are read: all of the pose is in `view`.
 template <class S> struct LensCamera : PinholeCamera<S> { Lens<S> lens; };
 
 // How an image is read out: at once, or by rows or columns in this order.
@@ -28,7 +28,7 @@ enum class Shutter : int { kGlobal, kTopToBottom, kLeftToRight, kBottomToTop, kR
 constexpr const char* kShutterNames[] = {"global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left"};
 constexpr int kNumShutters = sizeof(kShutterNames) / sizeof(kShutterNames[0]);
 
-// With a rolling shutter `view` is the pose at the first row, or column, and the lens is no pinhole: one without
+// With a rolling shutter `view` is the pose at the first row, or column, and the lens is not a pinhole: one without
 // distortion is kOpencv.
 template <class S> struct Camera : LensCamera<S> {
   Shutter shutter = Shutter::kGlobal;

@@ -393,7 +393,7 @@ inline double range_of(const Distortion<double>& d, double end, bool slopes) {
   return end;
 }
 
-// The undistorted radius over the distorted one, where that is r; at most that of the range.
+// The undistorted radius over the distorted one, r. The undistorted one is at most `range`.
 inline double stretch(const Distortion<double>& d, double range, double r) {
   double low = 0, high = range;
   for (int step = 0; step < 80; ++step) {

@@ -1,7 +1,7 @@
 // What goes in and out of the rasterizer, as plain structs of pointers. Every array is dense and row-major; N is the
 // number of Gaussians, F the number of features (colour channels, then z and 1/z on request), I of tile instances.
 //
-// A pointer may be null if its comment or that of its struct says so, and if its array has no elements. No other
+// A pointer may be null if its comment or its struct's says so, and if its array has no elements. No other
 // may: the passes of rasterize.h and rasterize_cuda.h refuse it.
 #pragma once
 
@@ -176,7 +176,7 @@ template <class S> struct GaussianGradients {
 constexpr int kNumGateGradients = 6;  // by the centre's x and y, the conic's xx, xy and yy, and the opacity
 template <class S> struct FootprintGradients {
   S* records = nullptr;       // [N, kNumGateGradients + F] those of the gate, then by the features
-  const S* depths = nullptr;  // [N] by the view depth, added to that of the features; or null. No blend writes it.
+  const S* depths = nullptr;  // [N] by the view depth, added to the features' gradient; or null. No blend writes it.
 };
 
 // One rendering, from its inputs to what it leaves for the backward pass. The backends differ in where the camera lies

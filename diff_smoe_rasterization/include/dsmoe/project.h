@@ -133,7 +133,7 @@ template <class S> struct ByMatrix {
   }
 };
 
-// Through its lens, which is no pinhole. All of the pose comes from the view matrix.
+// Through a lens other than a pinhole. All of the pose comes from the view matrix.
 template <class S> struct ByLens {
   using Point = LensPoint<S>;
   const LensCamera<S>& camera;
