@@ -2,8 +2,17 @@
 // the backend's types, and its functions with arguments of one form.
 #pragma once
 
+#include "dsmoe/rasterize_cuda.h"
 #include "op.h"
 #include "process.h"
+
+// Calls a pass over the pixels of a rendering (dsmoe/passes), which both backends have, on a Backend.
+#define DSMOE_WALK(Backend, pass, frame, map, options, memory) \
+  if constexpr (Backend::kOnHost) {                            \
+    cpu::pass(frame, map);                                     \
+  } else {                                                     \
+    cuda::pass(frame, map, Backend::work(options, memory));    \
+  }
 
 namespace dsmoe {
 namespace binding {

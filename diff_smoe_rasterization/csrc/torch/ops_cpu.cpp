@@ -71,9 +71,6 @@ struct CpuCore {
     cpu::mark_visible(frame, visible);
   }
 
-  // Calls a pass with what it takes behind its frame and its map.
-  template <class Pass> static void walk(const Call&, Pass pass) { pass(); }
-
   static void count_rows(const ViewBatch& batch) { cpu::count_rows(batch); }
   static void project_rows(const ViewBatch& batch) { cpu::project_rows(batch); }
   static void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients) {

@@ -62,6 +62,10 @@ struct CudaCore {
   }
   static cuda::Run run(const Call& call) { return run(call.options, call.times); }
 
+  static cuda::Work work(const Options& options, Allocator& memory) {
+    return {current_stream(), &memory, nullptr, options.deterministic};
+  }
+
   template <class Frame> static cuda::SavedSizes saved_sizes(const Frame& frame, const Options& options) {
     return cuda::saved_sizes(frame, run(options, nullptr));
   }
@@ -105,11 +109,6 @@ struct CudaCore {
   }
   template <class Frame> static void mark_visible(const Frame& frame, bool* visible) {
     cuda::mark_visible(frame, visible, {current_stream()});
-  }
-
-  // Calls a pass with what it takes behind its frame and its map.
-  template <class Pass> static void walk(const Call& call, Pass pass) {
-    pass(cuda::Work{current_stream(), &call.memory, nullptr, call.options.deterministic});
   }
 
   static void count_rows(const ViewBatch& batch) { cuda::count_rows(batch, {current_stream()}); }

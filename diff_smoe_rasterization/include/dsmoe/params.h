@@ -145,6 +145,21 @@ template <class S> struct ImageOutputs {
   S* gate_sum = nullptr;       // [H, W] the alpha image: W, or W / D in a mode with tails
 };
 
+// Sums over the pixels of each Gaussian, as removal.h says; written whole.
+template <class S> struct ImportanceSums {
+  S* shares = nullptr;          // [N]
+  S* squared_shares = nullptr;  // [N]
+  S* removal_costs = nullptr;   // [N]
+};
+
+// From a rendering's image and maps over it to what each Gaussian is worth.
+template <class S> struct ImportanceMap {
+  const S* color = nullptr;          // [C, H, W] as it was rendered
+  const S* pixel_weights = nullptr;  // [H, W] of squared shares and removal costs
+  const S* share_weights = nullptr;  // [H, W] of shares
+  ImportanceSums<S> sums;
+};
+
 // Any of these may be null. Then that output was not used.
 template <class S> struct ImageGradients {
   const S* color = nullptr;          // [C, H, W]

@@ -28,7 +28,6 @@
 #include "dsmoe/params.h"
 #include "dsmoe/passes/contributions.h"
 #include "dsmoe/passes/gate_map.h"
-#include "dsmoe/passes/importance.h"
 
 namespace dsmoe {
 namespace cpu {

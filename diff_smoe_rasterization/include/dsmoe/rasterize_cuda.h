@@ -30,7 +30,6 @@
 #include "dsmoe/params.h"
 #include "dsmoe/passes/contributions.h"
 #include "dsmoe/passes/gate_map.h"
-#include "dsmoe/passes/importance.h"
 
 using cudaStream_t = struct CUstream_st*;  // as in CUDA's own headers, which a caller need not have
 

@@ -29,8 +29,7 @@ template <class Backend> void contributions(Arguments& arguments) {
         Backend::template walked<S>(expect, radii, saved, blend_config<S>(background_gate, options), options);
     const ContributionMap<S> arguments = {data<S>(map), sums};
     TensorMemory memory(map);
-    // That of the frame's namespace, cpu or cuda.
-    Backend::walk(Call{options, memory, nullptr}, [&](const auto&... work) { contributions(own, arguments, work...); });
+    DSMOE_WALK(Backend, contributions, own, arguments, options, memory);
   });
   arguments.give_back(weights, pixels, blend_weights, distances);
 }

@@ -7,21 +7,6 @@
 
 namespace dsmoe {
 
-// Sums over the pixels of each Gaussian, as removal.h says; written whole.
-template <class S> struct ImportanceSums {
-  S* shares = nullptr;          // [N]
-  S* squared_shares = nullptr;  // [N]
-  S* removal_costs = nullptr;   // [N]
-};
-
-// From a rendering's image and maps over it to what each Gaussian is worth.
-template <class S> struct ImportanceMap {
-  const S* color = nullptr;          // [C, H, W] as it was rendered
-  const S* pixel_weights = nullptr;  // [H, W] of squared shares and removal costs
-  const S* share_weights = nullptr;  // [H, W] of shares
-  ImportanceSums<S> sums;
-};
-
 template <class S> struct ImportancePass {
   template <class Real> using Sums = Importance<Real>;
 
