@@ -24,6 +24,7 @@ from .settings import (
     Rendering,
     resolve_blend,
     resolve_lens,
+    resolve_shutter,
 )
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -123,12 +124,19 @@ def projection_arguments(settings: GaussianRasterizationSettings, means3D: torch
     return op_arguments("project_gaussians", settings, (), means3D, opacities, **tensors)
 
 
+def camera_tensors(settings: GaussianRasterizationSettings) -> List[torch.Tensor]:
+    """The tensors of a view that the ops on batches take, without a rolling shutter `viewmatrix` twice."""
+    end = settings.viewmatrix_end
+    return [settings.viewmatrix, settings.projmatrix, settings.campos, settings.viewmatrix if end is None else end]
+
+
 def image_numbers(settings: GaussianRasterizationSettings) -> List[float]:
     """What the ops on batches take of a view besides its tensors."""
     model, lens = resolve_lens(settings)
     most = _core.constants["most_lens_numbers"]
-    return [float(number) for number in (settings.image_width, settings.image_height, settings.tanfovx,
-                                         settings.tanfovy, model, len(lens))] + (lens + [0.0] * most)[:most]
+    numbers = (settings.image_width, settings.image_height, settings.tanfovx, settings.tanfovy, model, len(lens),
+               resolve_shutter(settings))
+    return [float(number) for number in numbers] + (lens + [0.0] * most)[:most]
 
 
 def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSettings,

@@ -152,8 +152,8 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
 
     folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed; with
     `overwrite` any, whose files of the same names are replaced.
-    outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
-    depth in the scene's units, 0 if nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
+    outputs: "depth" and "alpha" are written beside each. NAME.depth.npy [H, W] float32 is the expected view depth in
+    the scene's units, 0 if nothing is hit. NAME.alpha.png has 8 bits, white where Gaussians cover.
 
     ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: what `open_run`
     opens of the run that config is of, whose record these two must not contradict. Raises TrainerError.

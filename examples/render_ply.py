@@ -19,6 +19,9 @@ def load(path):
         "shs": torch.tensor(np.concatenate([stored.dc, stored.shs], axis=1)),
     }
     blend = {"blend_mode": stored.blend_mode or "alpha", "background_gate": stored.background_gate}
+    faint = [comment.split()[1] for comment in stored.comments if comment.startswith("faint_below ")]
+    if faint:  # not the mode's usual one
+        blend["faint_below"] = float(faint[0])
     return arguments, {**blend, "sh_degree": stored.sh_degree}
 
 
@@ -41,12 +44,25 @@ def save(image, path):
     Image.fromarray(values.permute(1, 2, 0).contiguous().numpy()).save(path)
 
 
+def ask_for_camera(parser):
+    """Offers a camera, which by default sees the room of train.py."""
+    parser.add_argument("--eye", type=float, nargs=3, default=[2.7, 1.6, 0.3], help="where the camera is")
+    parser.add_argument("--target", type=float, nargs=3, default=[0.0, 0.6, 0.0], help="what it looks at")
+
+
+def check_seen(rendering):
+    """Ends the program if the image is empty."""
+    if not (rendering.radii > 0).any():
+        raise SystemExit("no Gaussian is seen from there; --eye X Y Z and --target X Y Z say another camera")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("model", help="a .ply of 3DGS, or of this trainer")
-    parser.add_argument("--eye", type=float, nargs=3, default=[2.7, 1.6, 0.3], help="where the camera is")
-    parser.add_argument("--target", type=float, nargs=3, default=[0.0, 0.6, 0.0], help="what it looks at")
+    ask_for_camera(parser)
     parser.add_argument("-o", "--output", default="image.png")
     arguments = parser.parse_args()
     gaussians, options = load(arguments.model)
-    save(rasterize(settings=look_at(arguments.eye, arguments.target, **options), **gaussians).color, arguments.output)
+    rendering = rasterize(settings=look_at(arguments.eye, arguments.target, **options), **gaussians)
+    check_seen(rendering)
+    save(rendering.color, arguments.output)

@@ -106,8 +106,8 @@ def to_npz(model: Model, path: str) -> None:
 def synthetic(num_gaussians: int, width: int = 800, height: int = 533, seed: int = 0) -> Model:
     """Gaussians scattered through the view of one camera, as sizes, shapes and opacities of trained models scatter.
 
-    Depths are 2 to 10; on the image the median standard deviation is that of as many discs that tile it eight times,
-    axes differ by a median factor of about 3, and half of the opacities are below 0.3.
+    Depths are 2 to 10. On the image the median standard deviation is the one of as many discs that tile it eight times.
+    Axes differ by a median factor of about 3, and half of the opacities are below 0.3.
     """
     generator = torch.Generator().manual_seed(seed)
 

@@ -405,8 +405,8 @@ class TrainConfig:
         """Raises ConfigError if `later` cannot continue this run. Comes before `validate`, which knows no run."""
         differences = self.differences(later)
         if differences:
-            raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `--resume -o "
-                              f"{self.output}` alone keeps the run's options; more --iterations extend it")
+            raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `dsmoe train "
+                              f"--resume -o {self.output}` keeps the run's options; more --iterations extend it")
 
 
 def _recipe_of(strategy: str) -> Dict[str, Any]:

@@ -139,7 +139,7 @@ def _read_json(path: str) -> Dict[str, Any]:
 
 
 def _image_path(folder: str, name: str) -> str:
-    """Without an ending it is that of the file that is there, else .png."""
+    """A path without an ending gets the ending of the file that is there, else .png."""
     path = os.path.join(folder, name)
     if os.path.splitext(path)[1]:
         return path

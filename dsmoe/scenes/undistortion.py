@@ -96,7 +96,7 @@ def trains_natively(layout: Layout, lenses: str) -> bool:
 def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str]:
     """The layout with pinhole images in place of bent ones, and a line about that; empty if none are bent.
 
-    The pinhole camera has the focal lengths, the principal point and the size of the bent one: what lies beyond its
+    The pinhole camera has the focal lengths, the principal point and the size of the bent one. What lies beyond its
     borders is cut off, and pixels that the lens does not show are masked. Raises SceneError, also without OpenCV.
     """
     images = [*layout.train, *layout.test]
@@ -219,7 +219,7 @@ def _make_mask(plan: _Plan) -> None:
 
 
 def _unchanged(path: str, checksum: str) -> bytes:
-    """The content of a file, which must be that of the plan. Raises SceneError."""
+    """The content of a file, which must be as it was planned. Raises SceneError."""
     content = read_content(path)
     if _checksum(content) != checksum:
         raise SceneError(f"{path} has changed while the scene was loaded; type the same command again")

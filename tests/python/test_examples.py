@@ -4,6 +4,7 @@ from __future__ import annotations
 import ast
 import base64
 import contextlib
+import dataclasses
 import io as io_of_text
 import json
 import os
@@ -68,6 +69,19 @@ def test_further_images_are_written(model, tmp_path):
     assert (tmp_path / "images" / "alpha.png").is_file()
     nearest, farthest = map(float, re.findall(r"from ([\d.]+) to ([\d.]+)", text)[0])
     assert 0.2 < nearest < farthest < 12, "within the room, which is 8 units wide"
+
+
+@pytest.mark.parametrize("name", ["render_ply.py", "further_images.py"])
+def test_a_camera_that_sees_nothing_is_told(model, tmp_path, name):
+    with pytest.raises(SystemExit, match="no Gaussian is seen from there; --eye X Y Z and --target"):
+        run(name, model[0], "--eye", 0, 50, 0, "--target", 1, 90, 0, folder=tmp_path)
+
+
+def test_a_model_of_the_paper_is_rendered_by_its_rule(model, tmp_path):
+    load = runpy.run_path(str(EXAMPLES / "render_ply.py"))["load"]
+    path = tmp_path / "paper.ply"
+    io.write_gaussians(path, dataclasses.replace(io.read_gaussians(model[0]), comments=("faint_below 2",)))
+    assert load(path)[1]["faint_below"] == 2.0 and "faint_below" not in load(model[0])[1]
 
 
 def test_two_apis_render_the_same_image(tmp_path):

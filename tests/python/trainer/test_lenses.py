@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.system.files import PART
+from dsmoe.system.files import ABANDONED, PART, own_part
 
 WIDTH, HEIGHT = 96, 72
 FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0
@@ -391,15 +392,17 @@ def test_files_of_the_cache_have_the_usual_rights_and_what_a_kill_left_goes(tmp_
     cache.mkdir()
     with subprocess.Popen(["true"]) as ended:
         pass
-    (cache / f"{PART}{ended.pid}-0123.png").write_bytes(b"half")
-    (cache / f"{PART}{os.getppid()}-0123.png").write_bytes(b"another process writes it")
+    half, others = (cache / f"{own_part()}{number}-0123.png" for number in (ended.pid, os.getppid()))
+    for path in (half, others):  # a living process writes the second one
+        path.write_bytes(b"half")
+        os.utime(path, (time.time() - 2 * ABANDONED,) * 2)
     before = os.umask(0o027)
     try:
         load(folder)
     finally:
         os.umask(before)
     left = [name for name in os.listdir(cache) if name.startswith(PART)]
-    assert left == [f"{PART}{os.getppid()}-0123.png"]
+    assert left == [others.name]
     assert {os.stat(cache / name).st_mode & 0o777 for name in {*os.listdir(cache)} - {*left}} == {0o640}
 
 
