@@ -214,7 +214,8 @@ def blend_options(start: Start, given: Dict[str, Any]) -> Dict[str, Any]:
     if mode != start.blend_mode or mode not in GATED_MODES:
         return options
     options["faint_below"] = given.get("faint_below", trained_faint_below(mode, start.faint_below))
-    if given.get("background_gate", LEARNED) == LEARNED and "background_gate_start" not in given:
+    options["background_gate"] = given.get("background_gate", LEARNED)  # before $DSMOE_BACKGROUND_GATE
+    if options["background_gate"] == LEARNED and "background_gate_start" not in given:
         bound = given.get("background_gate_bound", learned_gate_of(mode)["background_gate_bound"])
         options["background_gate_start"] = max(start.background_gate, bound + LEAST_ABOVE_BOUND)
     return options

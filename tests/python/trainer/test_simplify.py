@@ -291,6 +291,9 @@ def test_a_model_that_says_nothing_of_faint_pairs_has_the_usual_rule(run, tmp_pa
         assert renderer.settings_of(camera).faint_below == 0.25
     assert blend_options(start, {})["faint_below"] == 0.25 and blend_options(start, {"faint_below": 1.0})[
         "faint_below"] == 1.0, "what is typed"
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.5")
+    config = TrainConfig(scene="scene", output="out", **blend_options(start, {}))
+    assert (config.background_gate, config.background_gate_start) == ("learned", 1.0)
 
 
 def test_a_model_folder_says_where_and_how_it_was_trained(run, tmp_path):
