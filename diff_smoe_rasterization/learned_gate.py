@@ -98,7 +98,7 @@ class ProcessGate:
         """Takes the lambda of a model that was read; with the `state_dict` of its training that goes on exactly."""
         start = value if value > 0 else START
         state = state or {"logarithm": math.log(start), "adam": {}}
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # renderings that come later have gradients
             self._logarithm.fill_(state["logarithm"])
             self._value.data = torch.full_like(self._value, start)
         self._adam = {name: one if name == "step" else torch.full_like(self._logarithm, one)
@@ -112,11 +112,14 @@ class ProcessGate:
 
     def of_rendering(self, blend_mode: str, tensors: Sequence[torch.Tensor], means3D: Optional[torch.Tensor]
                      ) -> Union[float, torch.Tensor]:
-        """Returns the lambda of a rendering. It has a gradient if one of the tensors has one.
+        """Returns the lambda of a rendering. It has a gradient if one of the tensors has one. Raises RuntimeError.
 
         tensors: of the Gaussians; lambda has the type and device of the first. means3D: their centres, if known.
         """
         self.blend_mode, like = blend_mode, tensors[0]
+        if like.is_cuda and torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("Python steps a learned background gate, and a CUDA graph does not repeat that; where a "
+                               "graph is captured give background_gate as a tensor or a number")
         with_gradient = not self.frozen and torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
         if not with_gradient and (self.frozen or self._found is not None):
             return self.value()

@@ -136,9 +136,10 @@ class Run:
         if not trainer.leads:
             return row
         folder = os.path.dirname(self._path(RESULTS_NAME))
-        for earlier in read_results(folder) if config.init else ():  # of a resumed run
-            if "start" in earlier:  # of `dsmoe simplify`
-                row["start"] = earlier["start"]
+        with contextlib.suppress(TrainerError):  # a damaged file is replaced
+            for earlier in read_results(folder) if config.init else ():  # of a resumed run
+                if "start" in earlier:  # of `dsmoe simplify`
+                    row["start"] = earlier["start"]
         write_results(folder, [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
         views = [*trainer.scene.test, *trainer.scene.train]

@@ -13,9 +13,7 @@ import importlib
 import importlib.util
 import json
 import os
-import re
 import shutil
-import socket
 import stat
 import struct
 import sys
@@ -34,8 +32,8 @@ __all__ = ["keep"]
 PROGRAM = "diff_smoe_rasterization"
 END, SIGNATURE = 22, b"PK\x05\x06"  # bytes of a zip file's last record without a comment, and its first four
 LONGEST = 65535  # bytes of such a comment
-PART = ".dsmoe_part-"  # begins the name of a folder with a file that is not whole yet; host and process follow
-ABANDONED = 24 * 3600  # seconds; containers with one host's name do not see each other's processes
+PART = ".dsmoe_part-"  # begins the name of a folder with a file that is not whole yet; a random name follows
+ABANDONED = 6 * 3600  # seconds in which no process, of this host or another, is at one file
 DAMAGE = (ValueError, OverflowError, RecursionError, OSError)
 _kept = False
 _told: Set[str] = set()
@@ -192,14 +190,11 @@ def _folder_beside(target: str) -> str:
         if os.path.exists(target) and not stat.S_ISREG(os.stat(target).st_mode):
             return ""
         where = os.path.dirname(target)
-        own = f"{PART}{socket.gethostname()}-"
-        for left in glob.glob(os.path.join(glob.escape(where), glob.escape(own) + "*")):
-            process = re.fullmatch(r"(\d+)-\w+", os.path.basename(left)[len(own):])
-            if process and not os.path.exists(f"/proc/{process[1]}"):  # it was killed
-                with contextlib.suppress(OSError):
-                    if time.time() - os.stat(left).st_mtime > ABANDONED:
-                        shutil.rmtree(left, ignore_errors=True)
-        return tempfile.mkdtemp(prefix=f"{own}{os.getpid()}-", dir=where)
+        for left in glob.glob(os.path.join(glob.escape(where), f"{PART}*", "")):
+            with contextlib.suppress(OSError):
+                if time.time() - os.stat(left).st_mtime > ABANDONED:  # of a process that was killed
+                    shutil.rmtree(left, ignore_errors=True)
+        return tempfile.mkdtemp(prefix=PART, dir=where)
     except OSError:
         return ""
 

@@ -6,16 +6,15 @@ import glob
 import json
 import math
 import os
-import socket
+import secrets
 import stat
 import time
-import zlib
 from typing import Any, BinaryIO, Callable, Iterator, Optional
 
 from ..errors import TrainerError
 
-PART = ".dsmoe_part-"  # begins the name of a file that is not whole yet; host and process follow
-ABANDONED = 24 * 3600  # seconds; containers with one host's name do not see each other's processes
+PART = ".dsmoe_part-"  # begins the name of a file that is not whole yet; a random number and its name follow
+ABANDONED = 6 * 3600  # seconds in which no process, of this host or another, leaves a file untouched that it writes
 
 
 def is_file(path: str) -> bool:
@@ -78,15 +77,14 @@ def check_output(path: str, overwrite: bool = True) -> None:
 def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
     """Gives the name of a file to write beside `path`, with its ending; without an error it becomes `path`.
 
-    No two processes of a host get the same name. What one left that was killed long ago is removed. Raises OSError,
-    which names `path`, and TrainerError as `check_output`, also if the file has come meanwhile.
+    No two processes get the same name. What one left that was killed long ago is removed. Raises OSError, which names
+    `path`, and TrainerError as `check_output`, also if the file has come meanwhile.
     """
     check_output(path, overwrite)
     folder, name = os.path.split(os.path.abspath(path))
     os.makedirs(folder, exist_ok=True)
     remove_unfinished(folder, name)
-    temporary = os.path.join(folder, f"{own_part()}{os.getpid()}-{name}")
-    _remove(temporary)  # of a process that had this number
+    temporary = os.path.join(folder, f"{PART}{secrets.token_hex(8)}-{name}")
     try:
         yield temporary
         check_output(path, overwrite)
@@ -99,35 +97,17 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
         _remove(temporary)
 
 
-def own_part() -> str:
-    """PART, and a checksum of this host's name: on a network folder another host's process may have the same number."""
-    return f"{PART}{zlib.crc32(os.fsencode(socket.gethostname())):08x}-"
-
-
 def remove_unfinished(folder: str, name: Optional[str] = None) -> None:
-    """Removes what processes of this host, killed long ago, left in a folder: all files, or those with one name."""
-    own = own_part()
-    for left in glob.glob(os.path.join(glob.escape(folder), f"{own}*-{glob.escape(name) if name else '*'}")):
-        number = os.path.basename(left)[len(own):].partition("-")[0]
+    """Removes what killed processes left in a folder: all files, or those with one name."""
+    for left in glob.glob(os.path.join(glob.escape(folder), f"{PART}*-{glob.escape(name) if name else '*'}")):
         with contextlib.suppress(OSError):  # it may be gone by now
-            if number.isdigit() and not _runs(int(number)) and time.time() - os.stat(left).st_mtime > ABANDONED:
+            if time.time() - os.lstat(left).st_mtime > ABANDONED:
                 _remove(left)
 
 
 def _remove(path: str) -> None:
     with contextlib.suppress(OSError):
         os.remove(path)
-
-
-def _runs(number: int) -> bool:
-    """Whether this machine has a process of that number."""
-    try:
-        os.kill(number, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # it is somebody else's
-        pass
-    return True
 
 
 def write_atomically(path: str, write: Callable[[Any], None], overwrite: bool = True) -> None:

@@ -216,3 +216,12 @@ def test_growing_contents_without_a_graph(mode, gpu):
     assert list_size(scenes[2], gpu)[1] > room, "nothing is outgrown"
     for scene, result in zip(scenes, results):
         assert_same(result, TrainingStep(scene, gpu)())  # which now has room
+
+
+def test_a_gate_of_the_process_is_not_captured(gpu):
+    """Each of its steps has other memory, which a replay would not know."""
+    step = TrainingStep(scene_of("smoe").with_settings(background_gate="learned"), gpu)
+    warm_up(step)
+    with pytest.raises(RuntimeError, match="give background_gate as a tensor or a number"):
+        with torch.cuda.graph(torch.cuda.CUDAGraph()):
+            step()

@@ -5,7 +5,6 @@ import json
 import math
 import os
 import shutil
-import subprocess
 import time
 
 import numpy as np
@@ -25,7 +24,7 @@ from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.system.files import ABANDONED, PART, own_part
+from dsmoe.system.files import ABANDONED, PART
 
 WIDTH, HEIGHT = 96, 72
 FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0
@@ -400,12 +399,10 @@ def test_files_of_the_cache_have_the_usual_rights_and_what_a_kill_left_goes(tmp_
     folder = write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, 0.2, 0.05, 0, 0], Image.new("RGB", (WIDTH, HEIGHT)))
     cache = tmp_path / ".dsmoe_cache"
     cache.mkdir()
-    with subprocess.Popen(["true"]) as ended:
-        pass
-    half, others = (cache / f"{own_part()}{number}-0123.png" for number in (ended.pid, os.getppid()))
-    for path in (half, others):  # a living process writes the second one
+    half, others = (cache / f"{PART}{number}-0123.png" for number in (1, 2))
+    for path, age in ((half, 2 * ABANDONED), (others, 60)):  # a process may be writing the second one
         path.write_bytes(b"half")
-        os.utime(path, (time.time() - 2 * ABANDONED,) * 2)
+        os.utime(path, (time.time() - age,) * 2)
     before = os.umask(0o027)
     try:
         load(folder)
