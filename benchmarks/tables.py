@@ -1,4 +1,4 @@
-"""Prints what README.md, RESULTS.md and NOTES.md take from rows in results/, and draws docs/budget-bonsai.png.
+"""Prints what README.md, RESULTS.md, NOTES.md and docs/ take from rows in results/, and draws docs/budget-bonsai.png.
 
     python benchmarks/tables.py                                # tables and sentences, for the pages
     python benchmarks/tables.py --figure docs/budget-bonsai.png
@@ -231,14 +231,71 @@ def transmittance_table() -> str:
                        for blend in ("smoe_eq7", *ABLATED))] for end in (0.005, 0.0002)))
 
 
+TRAINERS = {"3dgs-2023": "3DGS of 2023", "c3dgs": "c3dgs", "compact-3dgs": "Compact-3DGS", "taming": "Taming",
+            "hac": "HAC", "hac-plus": "HAC++"}
+
+
+def plugged_rows() -> Dict[Tuple[str, str], Dict[str, Row]]:
+    """The suite `table2` on bonsai, by trainer and end ("sparse", "dense"), then by rule."""
+    rows = [row for row in rows_of("table2_h200.jsonl") if row["suite"] == "table2" and row["scene"] == "bonsai"
+            and row["variant"] == "patched" and row["seed"] == 0]
+    found: Dict[Tuple[str, str], Dict[str, Row]] = {}
+    for method, end in ((method, end) for method in TRAINERS for end in ("sparse", "dense")):
+        chosen = {rule_of(row): row for row in rows if row["method"] == method and end_of(row) == end}
+        if len(chosen) > 1:  # a row alone is compared with nothing
+            found[method, end] = chosen
+    return found
+
+
+def end_of(row: Row) -> str:
+    return row["end"] or ("sparse" if row["densify_grad_threshold"] > 0.001 else "dense")
+
+
+def rule_of(row: Row) -> str:
+    """Of RULES."""
+    return ("alpha" if row["blend_mode"] == "alpha" else "learned" if row["background_gate"] == "learned" else
+            "program")
+
+
+def megabytes(row: Row) -> float:
+    return row["size_bytes"]["own"] / 1e6
+
+
+def table_2() -> str:
+    """PSNR, LPIPS, primitives and megabytes of the file."""
+    lines = []
+    for (method, end), rules in plugged_rows().items():
+        lines.append([f"{TRAINERS[method]}, {end}", *("–" if rule not in rules else ", ".join(
+            [*figures([rules[rule]])[::2], thousands([rules[rule]]), f"{megabytes(rules[rule]):.2f}"])
+            for rule in RULES)])
+    return table(["PSNR, LPIPS, number, MB", *RULES.values()], lines)
+
+
+def between(points: Sequence[Tuple[float, float]], at: float) -> float:
+    """y at an x within two points (x, y), interpolated over the logarithm of the first."""
+    (left, low), (right, high) = points
+    return low + (high - low) * math.log(at / left) / math.log(right / left)
+
+
+def equal_size(method: str, rule: str) -> Tuple[List[float], List[float]]:
+    """A rule against alpha where the sizes and the PSNR of both ends overlap: dB at equal megabytes, and per cent of
+    megabytes at equal PSNR, at both ends of the overlap."""
+    cells = plugged_rows()
+    curves = [[(megabytes(cells[method, end][name]), cells[method, end][name]["psnr"]) for end in ("sparse", "dense")]
+              for name in ("alpha", rule)]
+    sizes, levels_ = ([(max(one[0][axis] for one in curves)), min(one[1][axis] for one in curves)] for axis in (0, 1))
+    gains = [between(curves[1], size) - between(curves[0], size) for size in sizes]
+    at = [[number_at(curve, level) or math.nan for curve in curves] for level in levels_]
+    return gains, [100 * (smoe / alpha - 1) for alpha, smoe in at]
+
+
 RULES = {"alpha": "alpha", "learned": "smoe", "program": "the authors' program"}
 
 
 def timed() -> Dict[Tuple[str, str], Row]:
     """Trainings by the recipe at 0.0002 that were alone on a card, by scene and rule."""
     rows = [row for row in rows_of("paper_suites_h200.jsonl") if row["suite"] == "fig5"]
-    return {(row["scene"], "alpha" if row["blend_mode"] == "alpha" else "learned" if row["background_gate"] == "learned"
-             else "program"): row for row in rows}
+    return {(row["scene"], rule_of(row)): row for row in rows}
 
 
 def time_table() -> str:
@@ -277,6 +334,8 @@ def race_lines() -> List[List[str]]:
     """
     lines = []
     for (trainer,), evaluations in grouped(rows_of("race_h100.jsonl"), "trainer").items():
+        if "--fast" in trainer:  # it was another preset then
+            continue
         runs = list(grouped(evaluations, "seed").values())
         times = [[next((row["train_seconds"] for row in run if row["psnr"] >= bound), math.nan) for run in runs]
                  for bound in BOUNDS]
@@ -315,6 +374,53 @@ def rules_table() -> str:
                 for rule in columns.values()]
         lines.append((SCENES.index(scene), -threshold, [f"{scene} {threshold:g}", *line]))
     return table(["", *columns], (line for *_, line in sorted(lines)))
+
+
+def simplified() -> Dict[Tuple[str, int], Dict[Tuple[str, str], List[Row]]]:
+    """Runs of `dsmoe simplify` by scene and budget, then by teacher and blend."""
+    rows = [row for row in rows_of("simplify_h200.jsonl") if row.get("run") == 2]
+    order = {"bonsai": 0, "fox": 1}
+    cells = sorted(grouped(rows, "scene", "budget").items(), key=lambda item: (order[item[0][0]], -item[0][1]))
+    return {key: grouped(found, "teacher", "blend_mode") for key, found in cells}
+
+
+def simplify_table() -> str:
+    """A line for each model and number of Gaussians."""
+    lines, named = [], set()
+    for (scene, budget), kinds in simplified().items():
+        alpha, first = kinds["photographs", "alpha"], kinds["photographs", "alpha"][0]
+        name = "" if scene in named else ", ".join([
+            scene, f"{first['start_gaussians'] / 1000:,.0f}k", f"{first['start_psnr']:.2f} dB",
+            f"{first['start_bytes'] / 1e6:.0f} MB"])
+        named.add(scene)
+        spz = next(row["spz_bytes"] for row in alpha if "spz_bytes" in row)
+        lines.append([name, f"{budget:,}", f"{shown(alpha, 'psnr', 2)}, {mean(alpha, 'ssim'):.3f}",
+                      f"{mean(kinds['own renderings', 'alpha'], 'psnr'):.2f}",
+                      f"{mean(kinds['photographs', 'smoe'], 'psnr'):.2f}", f"{mean(alpha, 'train_seconds'):.1f}",
+                      f"{mean(alpha, 'bytes') / 1e6:.1f}, {spz / 1e6:.1f}"])
+    return table(["model by the recipe", "to", "PSNR, SSIM", "own renderings", "`smoe`", "s", "MB as `.ply`, `.spz`"],
+                 lines)
+
+
+def presets_table() -> str:
+    """The recipe, the default and --best, of one seed."""
+    columns = {"recipe": "--strategy 3dgs", "default": "none", "`--best`": "--best"}
+    cells = grouped((row for row in rows_of("presets_h200.jsonl") if not row["alone"]), "scene", "blend_mode")
+    lines = []
+    for (scene, blend), rows in sorted(cells.items(), key=lambda item: (SCENES.index(item[0][0]), item[0][1])):
+        found = {row["options"]: f"{row['psnr']:.2f}, {row['ssim']:.3f}, "
+                 + ("–" if row["lpips_alex"] is None else f"{row['lpips_alex']:.3f}") + f"; {thousands([row])}"
+                 for row in rows}
+        if columns["recipe"] in found:  # else there is nothing beside it
+            lines.append([f"{scene}, {blend}", *(found.get(options, "–") for options in columns.values())])
+    return table(["PSNR, SSIM, LPIPS; Gaussians", *columns], lines)
+
+
+def fast_runs(blend: str) -> List[Row]:
+    """Trainings by --fast, alone on a card, with the seconds to 30.0 and 31.5 dB: of the first evaluation there."""
+    return [{**row, **{f"to {bound}": next((seconds for _, seconds, psnr in row["history"] if psnr >= bound), math.nan)
+                       for bound in (30.0, 31.5)}} for row in rows_of("presets_h200.jsonl")
+            if row["alone"] and row["run"] == 2 and row["options"] == "--fast" and row["blend_mode"] == blend]
 
 
 def span(values: Iterable[float], digits: int = 0, sign: str = "") -> str:
@@ -365,18 +471,43 @@ def sentences() -> Dict[str, List[str]]:
     sparse_plugged = plugged(("3dgs-2023", "3dgs-2024", "c3dgs"), "sparse")
     dense_plugged = plugged(("3dgs-2023", "c3dgs"), "dense")
     bounded = plugged(("taming", "hac", "hac-plus"), "sparse")[0], plugged(("taming", "hac", "hac-plus"), "dense")[0]
+    found = plugged_rows()
+    compact = [found["compact-3dgs", "sparse"][rule] for rule in RULES]
+    compact_gains = span([row["psnr"] - compact[0]["psnr"] for row in compact[1:]], 1)
+    compact_more = span([-fewer([row], compact[:1]) for row in compact[1:]])
+    compact_smaller = span([100 * (1 - megabytes(row) / megabytes(compact[0])) for row in compact[1:]])
+    hac = [(found["hac", end]["alpha"], found["hac", end][rule]) for end in ("sparse", "dense") for rule in RULES
+           if rule != "alpha"]
+    hac_gains = span([smoe["psnr"] - alpha["psnr"] for alpha, smoe in hac], 2, "+")
+    equal_gains, equal_sizes = ([value for rule in RULES if rule != "alpha" for value in equal_size("hac", rule)[kind]]
+                                for kind in (0, 1))
     newest = plugged_2024()
     newest_loss = [less(alpha, smoe, "psnr") for alpha, smoe in newest]
+    fast = {blend: fast_runs(blend) for blend in BLENDS}
+
+    def both(name: str, digits: int, what: str = "") -> str:  # by alpha and by smoe
+        return " and ".join(f"{mean(fast[blend], name):.{digits}f}" for blend in BLENDS) + what
+
+    large = next(row for row in rows_of("simplify_h200.jsonl") if "peak_reserved_bytes" in row)
+    searched = next(row for row in rows_of("simplify_h200.jsonl") if "loses" in row)
+    on_fox = {row["options"]: row["psnr"] for row in rows_of("presets_h200.jsonl") if row["scene"] == "fox"}
+    fast_fox = next(row["psnr"] for row in rows_of("fast_h200.jsonl") if row["trial"].startswith("D")
+                    and (row["scene"], row["blend_mode"]) == ("fox", "alpha"))
     newest_span = f"3DGS of 2024 loses {span(newest_loss, 1)} dB"
     return {
         "README.md": [
+            f"Compact-3DGS gains {compact_gains} dB at 0.005", f"HAC changes by {hac_gains} dB",
             newest_span, f"keep their quality with {dense_plugged[1]} Gaussians",
             few, equal, f"{slower_fps['learned']} % slower", f"loses {span(authors, 1)} dB",
             f"bonsai loses {span(ablated, 1)} dB", f"Lego loses {-lego[-1]:.2f} dB",
             f"in {ours[0]} s by alpha and {ours[1]} s by smoe, where LiteGS takes {lite}",
+            f"`--fast` has 31.5 dB after {both('to 31.5', 1)} s",
             f"{span(faster['fastergs'], 1)} times as fast as Faster-GS",
             f"{span(faster['gsplat unpacked'], 1)} times as fast as gsplat"],
         "benchmarks/RESULTS.md": [
+            f"gains {compact_gains} dB with {compact_more} % more Gaussians and {compact_smaller} % smaller files",
+            f"changes by {hac_gains} dB", f"{span(equal_gains, 2, '+')} dB at equal size",
+            f"{-min(equal_sizes):.0f} % smaller to {max(equal_sizes):.0f} % larger at equal PSNR",
             "-{:.1f} dB on bonsai, -{:.1f} on fox, ".format(*newest_loss)
             + f"with {span(fewer(smoe, alpha) for alpha, smoe in newest)} % fewer",
             levels_sentence(), f"{sparse_plugged[0]} with {sparse_plugged[1]}",
@@ -393,8 +524,18 @@ def sentences() -> Dict[str, List[str]]:
             f"lego loses {span(authors, 1)} dB", f"bonsai loses {span(ablated, 1)} dB",
             f"{slower} times as long as alpha", f"{span(many[30_000] + many[100_000], 1)} times as many",
             f"{span(many[10_000], 1)} times as many", f"{slower_fps['learned']} % slower",
-            f"{slower_fps['program']} % slower", f"trains {longer} % longer"],
+            f"{slower_fps['program']} % slower", f"trains {longer} % longer",
+            f"30.0 dB after {both('to 30.0', 1)} s (alpha and smoe), 31.5 dB after {both('to 31.5', 1)} s, and ends "
+            f"after {both('train_seconds', 1)} s with {both('psnr', 2)} dB",
+            f"On fox the default is {on_fox['--strategy 3dgs'] - on_fox['none']:.1f} dB behind",
+            f"has {fast_fox:.2f} dB with as many, `--budget 13700` "
+            f"{mean(by_budget['fox', 13700]['alpha',], 'psnr'):.2f}"],
+        "docs/simplify.md": [
+            f"`--loses {searched['loses']}` ended with {searched['num_gaussians']:,} Gaussians on {searched['scene']}",
+            f"{large['start_gaussians'] / 1e6:.2f} million Gaussians to {large['budget']:,} took "
+            f"{large['peak_reserved_bytes'] / 1e9:.1f} GB of GPU memory"],
         "docs/paper.md": [
+            f"gains {compact_gains} dB", f"HAC changes by {hac_gains} dB",
             newest_span, "edges gain {:.2f} where pictures gain {:.2f} dB on fox, ".format(*edges["fox"])
             + "{:.2f} for {:.2f} on room35".format(*edges["room35"]),
             few.replace("fewer Gaussians ", ""), f"{-ablated[2]:.1f} and {-ablated[3]:.1f} dB against Eq. 7",
@@ -448,9 +589,9 @@ def main() -> None:
     parser.add_argument("--figure", metavar="PNG", help="draw it here")
     options = parser.parse_args()
     rows = trainings()
-    for text in (first_table(), budget_table(rows), recipe_table(), table_1(),
+    for text in (first_table(), budget_table(rows), recipe_table(), table_1(), table_2(),
                  time_table(), transmittance_table(),
-                 rules_table(), race_table(),
+                 rules_table(), race_table(), presets_table(), simplify_table(),
                  *(f"{page}: {text}" for page, texts in sentences().items() for text in texts)):
         print(text, end="\n\n")
     if options.figure:

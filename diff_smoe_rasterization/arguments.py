@@ -16,6 +16,7 @@ from .settings import (
     resolve_blend,
     resolve_faint_below,
     resolve_lens,
+    resolve_shutter,
 )
 
 
@@ -32,6 +33,7 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
         if tensor is not None:
             inputs[name] = optional(name, tensor)
     look_for_raw_values(function, inputs, settings.debug)
+    # Only background_gate="learned" reads the tensors: that gate waits for the step of the optimizer that has means3D.
     background_gate = gate_of(background_gate, blend_mode, inputs.values(), means3D)
     fixed_gate = background_gate
     if isinstance(background_gate, torch.Tensor):
@@ -39,6 +41,8 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
     inputs["bg"] = required("bg", settings.bg)
     for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
         inputs[name] = without_batch(required(name, getattr(settings, name)), dim)
+    if settings.viewmatrix_end is not None:
+        inputs["viewmatrix_end"] = without_batch(required("viewmatrix_end", settings.viewmatrix_end), 2)
     return [inputs.get(name) for name in INPUTS], op_options(function, settings, outputs, blend_mode, fixed_gate)
 
 
@@ -54,19 +58,20 @@ def op_options(function, settings, outputs, blend_mode, fixed_gate):
     # Unchanged by conversion: so it was not a string (float() and bool() take those) and lost no digits.
     if options != given or not all([-_WHOLE_LIMIT < options[place] < _WHOLE_LIMIT for place in _WHOLE_OPTIONS]):
         for (name, kind), value in zip(_SETTING_OPTIONS, given):
-            if not _fits(kind, value):
-                raise ValueError(f"{function}: {name} is {value!r}; it must be {_KINDS[kind]}")
+            if not fits(kind, value):
+                raise ValueError(f"{function}: {name} is {value!r}; it must be {KINDS[kind]}")
     faint_below = resolve_faint_below(blend_mode, settings.faint_below)
+    shutter = resolve_shutter(settings)
     model, lens = resolve_lens(settings)
-    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens,
+    computed = [faint_below, fixed_gate, BLEND_MODES.index(blend_mode), model, lens, shutter,
                 *[name in outputs for name in FEATURE_OUTPUTS]]
     for place, value in zip(_COMPUTED_OPTIONS.values(), computed):
         options.insert(place, value)
     return options
 
 
-def _fits(kind, value):
-    """Whether a setting can be an option of this type."""
+def fits(kind, value):
+    """Whether a setting can be an option of this type, a key of KINDS."""
     try:
         option = kind(value)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a tensor of several elements
@@ -75,7 +80,7 @@ def _fits(kind, value):
 
 
 _OUTPUTS = frozenset(OUTPUTS)
-_KINDS = {int: "a whole number below 2^63", float: "a number", bool: "True or False"}
+KINDS = {int: "a whole number below 2^63", float: "a number", bool: "True or False"}
 _WHOLE_LIMIT = 2**63
 
 # The options that are computed, with their places; the others are settings of the same name. `rasterize_op` decides
@@ -83,7 +88,7 @@ _WHOLE_LIMIT = 2**63
 assert list(OPTIONS)[-1] == "for_backward"
 _COMPUTED_OPTIONS = {name: list(OPTIONS).index(name)
                      for name in ("faint_below", "fixed_background_gate", "blend_mode", "camera_model", "lens",
-                                  *FEATURE_OUTPUTS)}
+                                  "rolling_shutter", *FEATURE_OUTPUTS)}
 assert list(_COMPUTED_OPTIONS.values()) == sorted(_COMPUTED_OPTIONS.values())  # they are inserted in this order
 _SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
 _WHOLE_OPTIONS = [place for place, (_, kind) in enumerate(_SETTING_OPTIONS) if kind is int]

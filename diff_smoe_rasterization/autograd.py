@@ -238,23 +238,8 @@ def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
     return _fake_gradients(inputs, present, others[-1])
 
 
-def _fake_mark_visible(positions, viewmatrix, near, camera_model=0):
+def _fake_mark_visible(positions, viewmatrix, near, camera_model=0, viewmatrix_end=None):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
-
-
-def _fake_contributions(pixel_weights, radii, *others):
-    def sums():
-        return pixel_weights.new_empty(radii.shape)
-
-    return sums(), torch.empty_like(radii), sums(), sums()
-
-
-def _fake_importance(pixel_weights, share_weights, color, gate_sum, bg, radii, *others):
-    return tuple(pixel_weights.new_empty(radii.shape) for _ in range(3))
-
-
-def _fake_gate_map(gate_sum, radii, *others):
-    return tuple(radii.new_empty(gate_sum.shape[1:]) for _ in range(3))
 
 
 def _on_one_device(name, fake):
@@ -275,13 +260,18 @@ def _on_one_device(name, fake):
     return checked
 
 
+def register_fake(op, fake):
+    """Registers the function that gives an op's results without their values, if this torch can have one."""
+    if _CAN_REGISTER:
+        torch.library.register_fake(_NAME + op, _on_one_device(op, fake))
+
+
+_NAME = "diff_smoe_rasterization::"
+for _op, _fake in (("rasterize", _fake_rasterize), ("rasterize_backward", _fake_rasterize_backward),
+                   ("project", _fake_project), ("project_backward", _fake_project_backward),
+                   ("radii", _fake_radii), ("mark_visible", _fake_mark_visible),
+                   ("gate_adam", lambda *arguments: None)):
+    register_fake(_op, _fake)
 if _CAN_REGISTER:
-    _NAME = "diff_smoe_rasterization::"
-    for _op, _fake in (("rasterize", _fake_rasterize), ("rasterize_backward", _fake_rasterize_backward),
-                       ("project", _fake_project), ("project_backward", _fake_project_backward),
-                       ("radii", _fake_radii), ("mark_visible", _fake_mark_visible),
-                       ("contributions", _fake_contributions), ("importance", _fake_importance),
-                       ("gate_map", _fake_gate_map), ("gate_adam", lambda *arguments: None)):
-        torch.library.register_fake(_NAME + _op, _on_one_device(_op, _fake))
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
     torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)

@@ -24,6 +24,7 @@ from .settings import (
     Rendering,
     resolve_blend,
     resolve_lens,
+    resolve_shutter,
 )
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -77,8 +78,10 @@ class Footprints(NamedTuple):
         """Those of an equirectangular image of this width, and the footprints that cross its seam on both sides of it.
 
         The second copy of a footprint follows the others, moved by the width. Radii count 3 sigma: what lies beyond is
-        still cut. The host waits for the number of copies.
+        still cut. The host waits for the number of copies. Raises ValueError for a width below 1.
         """
+        if width < 1:
+            raise ValueError(f"around: width is {width}; it must be that of the equirectangular image, 1 or more")
         left = ((self.radii > 0) & (self.gates[:, 0] < self.radii)).nonzero().squeeze(1)
         right = ((self.radii > 0) & (self.gates[:, 0] > width - 1 - self.radii)).nonzero().squeeze(1)
         parts = [self]
@@ -121,12 +124,19 @@ def projection_arguments(settings: GaussianRasterizationSettings, means3D: torch
     return op_arguments("project_gaussians", settings, (), means3D, opacities, **tensors)
 
 
+def camera_tensors(settings: GaussianRasterizationSettings) -> List[torch.Tensor]:
+    """The tensors of a view that the ops on batches take, without a rolling shutter `viewmatrix` twice."""
+    end = settings.viewmatrix_end
+    return [settings.viewmatrix, settings.projmatrix, settings.campos, settings.viewmatrix if end is None else end]
+
+
 def image_numbers(settings: GaussianRasterizationSettings) -> List[float]:
     """What the ops on batches take of a view besides its tensors."""
     model, lens = resolve_lens(settings)
     most = _core.constants["most_lens_numbers"]
-    return [float(number) for number in (settings.image_width, settings.image_height, settings.tanfovx,
-                                         settings.tanfovy, model, len(lens))] + (lens + [0.0] * most)[:most]
+    numbers = (settings.image_width, settings.image_height, settings.tanfovx, settings.tanfovy, model, len(lens),
+               resolve_shutter(settings))
+    return [float(number) for number in numbers] + (lens + [0.0] * most)[:most]
 
 
 def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSettings,

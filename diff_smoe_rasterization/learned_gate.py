@@ -25,6 +25,7 @@ RATE = 0.03  # of Adam, for the logarithm
 BETAS = (0.9, 0.999)
 EPSILON = 1e-8
 LIMIT = math.log(MAX_BACKGROUND_GATE)  # of |log lambda|: beyond it float32 would soon be 0 or infinite
+_gate_adam = torch.ops.diff_smoe_rasterization.gate_adam.default
 
 
 def launch_step(logarithm: torch.Tensor, moment: torch.Tensor, square: torch.Tensor, value: torch.Tensor,
@@ -32,10 +33,9 @@ def launch_step(logarithm: torch.Tensor, moment: torch.Tensor, square: torch.Ten
                 bound: float) -> None:
     """One step of Adam in place on a gate's logarithm p; value becomes bound + exp(p). Tensors [1]; nothing waits.
 
-    gradient: by the value. rate, root_scale: as `corrected_rates` gives them.
+    gradient: by the value; one that is not finite counts as 0. rate, root_scale: as `corrected_rates` gives them.
     """
-    torch.ops.diff_smoe_rasterization.gate_adam(logarithm, moment, square, value, gradient, rate, root_scale, *betas,
-                                                EPSILON, bound, LIMIT)
+    _gate_adam(logarithm, moment, square, value, gradient, rate, root_scale, *betas, EPSILON, bound, LIMIT)
 
 
 def step_gate(logarithm: torch.Tensor, adam: Dict[str, Any], value: torch.Tensor, gradient: torch.Tensor, rate: float,
@@ -56,7 +56,7 @@ class ProcessGate:
         self.reset()
 
     def reset(self, frozen: bool = False) -> None:
-        """Begins at START. frozen: it is that of a trained model, which `found` will say, and is never stepped."""
+        """Begins at START. frozen: the gate of a trained model; `found` sets it, nothing steps it."""
         self.frozen = frozen
         self.renders = False  # whether anything was rendered, with this gate or another
         self.blend_mode: Optional[str] = None  # of the last rendering with this gate; None: there was none
@@ -100,7 +100,7 @@ class ProcessGate:
         state = state or {"logarithm": math.log(start), "adam": {}}
         with torch.no_grad():
             self._logarithm.fill_(state["logarithm"])
-            self._value.fill_(start)
+            self._value.data = torch.full_like(self._value, start)
         self._adam = {name: one if name == "step" else torch.full_like(self._logarithm, one)
                       for name, one in state["adam"].items()}
         self._found, self._value.grad = value, None
@@ -128,8 +128,7 @@ class ProcessGate:
         self._begin()
         if means3D is not None:
             self._watch(means3D)
-        # A tensor of its own for each rendering: a step between it and its backward pass changes none of them.
-        value = self._value.clone()
+        value = self._value.view(1)  # a step between a rendering and its backward pass changes none: see `_step`
         if self._found == 0:  # the logarithm cannot begin there: until the first step 0 is rendered
             value = value - self._value.detach()
         return value.to(like)
@@ -187,10 +186,10 @@ class ProcessGate:
 
     @torch.no_grad()
     def _step(self, gradient: torch.Tensor) -> None:
-        """One step. A gradient that is not finite, as of a scaled loss that overflowed, counts as 0."""
-        finite = torch.nan_to_num(gradient, 0.0, 0.0, 0.0)
-        step_gate(self._logarithm, self._adam, self._value, finite, RATE, BETAS, 0.0)
-        self._found = None
+        """One step, in one launch: the new value has memory of its own, and renderings keep the one that they have."""
+        value = torch.empty_like(self._value)
+        step_gate(self._logarithm, self._adam, value, gradient, RATE, BETAS, 0.0)
+        self._value.data, self._found = value, None
 
 
 def _alive(reference: Any) -> Any:

@@ -7,7 +7,7 @@ import torch
 
 from .arguments import as_rendering, op_arguments, tensor_checks, without_batch
 from .autograd import rasterize_op, refuse_transforms
-from .settings import GaussianRasterizationSettings, Rendering, resolve_lens
+from .settings import GaussianRasterizationSettings, Rendering, resolve_lens, resolve_shutter
 from .splats import Splats
 
 
@@ -22,8 +22,10 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
-        settings: camera and options. Its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
-            differentiable too, each on its own.
+        settings: camera and options. Its viewmatrix, viewmatrix_end, projmatrix, campos, bg and, as a tensor,
+            background_gate are differentiable too, each on its own. With background_gate="learned", and only then, the
+            rendering is a step of a training: the gate of this process is stepped when the optimizer that holds means3D
+            is.
         means2D: [N, 3]; only its gradient is used: dL/d(pixel) times (width / 2, height / 2), z = 0.
             Densification reads it.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.
@@ -122,8 +124,11 @@ class GaussianRasterizer(torch.nn.Module):
         viewmatrix = without_batch(required("viewmatrix", self.raster_settings.viewmatrix), 2)
         refuse_transforms("markVisible", (positions, viewmatrix))
         model, _ = resolve_lens(self.raster_settings)
+        end = self.raster_settings.viewmatrix_end if resolve_shutter(self.raster_settings) > 0 else None
+        if end is not None:
+            end = without_batch(required("viewmatrix_end", end), 2)
         return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near),
-                                                              model)
+                                                              model, end)
 
     def forward(self, means3D: torch.Tensor, means2D: _Absent, opacities: torch.Tensor, shs: _Absent = None,
                 colors_precomp: _Absent = None, scales: _Absent = None, rotations: _Absent = None,

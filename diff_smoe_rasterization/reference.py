@@ -12,7 +12,8 @@ What the paper leaves open is decided here:
   infinite, its opacity is above 1e20, its view depth is not beyond `near`, its projected covariance is not positive
   definite, its pixel position, conic or colour is not finite, or its footprint misses the image.
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
-- With a camera model other than "pinhole", a Gaussian beyond its lens's range is culled too: see `lens_points`.
+- With a camera model other than "pinhole", a Gaussian beyond its lens's range is culled too: see `lens_points`. With a
+  rolling shutter, so is one that moves about as fast as it: see `rolling_points`.
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `tail_sum`.
@@ -106,8 +107,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
-        settings: GaussianRasterizationSettings; viewmatrix, projmatrix, campos, bg and a tensor background_gate are
-            differentiable.
+        settings: GaussianRasterizationSettings; viewmatrix, viewmatrix_end, projmatrix, campos, bg and a tensor
+            background_gate are differentiable.
         means2D: [N, 3]; its gradient is dL/d(pixel) times (0.5 width, 0.5 height), z = 0.
         dc, shs: [N, 1, 3] and [N, K - 1, 3], or only shs [N, K, 3]; K >= (sh_degree + 1)^2.
         colors_precomp: [N, C] instead of dc and shs.
@@ -277,12 +278,16 @@ def visible(gaussians, settings, mode):
 
 def project(gaussians, settings):
     """Projects Gaussians to the image plane (Eq. 1, 2; EWA splatting as in 3DGS)."""
-    view = _transform(gaussians.means3D, settings.viewmatrix)[:, :3]
-    position, depth, jacobian = (pinhole_points if settings.camera_model == "pinhole" else lens_points)(
-        gaussians.means3D, view, settings)
+    if settings.rolling_shutter == "global":
+        view = _transform(gaussians.means3D, settings.viewmatrix)[:, :3]
+        turn = settings.viewmatrix[:3, :3].T
+        points = pinhole_points if settings.camera_model == "pinhole" else lens_points
+        position, depth, jacobian = points(gaussians.means3D, view, settings)
+    else:
+        position, depth, jacobian, turn = rolling_points(gaussians.means3D, settings)
     position = position + gaussians.means2D[:, :2] * position.new_tensor(
         [settings.image_width / 2, settings.image_height / 2])
-    to_image = jacobian @ settings.viewmatrix[:3, :3].T
+    to_image = jacobian @ turn
     raw = to_image @ covariance3D(gaussians, settings.scale_modifier) @ to_image.transpose(1, 2)
     raw_xx, xy, raw_yy = raw[:, 0, 0], raw[:, 0, 1], raw[:, 1, 1]
     xx, yy = raw_xx + settings.low_pass, raw_yy + settings.low_pass
@@ -342,6 +347,52 @@ def positions_and_depths(view, settings):
     """Returns both of a lens, [n, 2] and [n], without asking what the lens sees. view: [n, 3]."""
     model, numbers = settings.camera_model, [float(number) for number in settings.distortion]
     return _image(view, settings)[2](on_plane(view, model, numbers)[0]), _depths(view, model)
+
+
+FIRST_TIME, LAST_TIME = -0.15, 1.15  # of a rolling shutter: 0 is the first row, or column, and 1 the last
+SHUTTER_SPEED_MIN = 0.1  # what moves with the shutter at more than 1 - this of its speed is culled
+
+
+def rolling_points(points, settings):
+    """The same of a rolling shutter, with the rotations [n, 3, 3] from world to view at the times of the points.
+
+    A point is seen at the time t for which its pixel, by the pose (1 - t) first + t last, is in the row read at t. The
+    time is found by bisection. One step of Newton's method from there, which does not move it, gives it derivatives.
+    """
+    axis = 0 if settings.rolling_shutter in ("left_to_right", "right_to_left") else 1
+    sign = -1 if settings.rolling_shutter in ("bottom_to_top", "right_to_left") else 1
+    length = max((settings.image_width, settings.image_height)[axis] - 1, 1)
+    first = _transform(points, settings.viewmatrix)[:, :3]
+    motion = _transform(points, settings.viewmatrix_end)[:, :3] - first
+    settings = settings._replace(camera_model=settings.camera_model.replace("pinhole", "opencv"))
+
+    def late(time):
+        place = positions_and_depths(first + time[:, None] * motion, settings)[0][:, axis]
+        return (place if sign > 0 else length - place) - length * time
+
+    with torch.no_grad():
+        low, high = torch.full_like(points[:, 0], FIRST_TIME), torch.full_like(points[:, 0], LAST_TIME)
+        for _ in range(64):
+            time = (low + high) / 2
+            later = late(time) > 0
+            low, high = torch.where(later, time, low), torch.where(later, high, time)
+        time = (low + high) / 2
+        stands_still = (time < FIRST_TIME + 1e-9) | (time > LAST_TIME - 1e-9)
+        time = time.masked_fill(time < FIRST_TIME + 1e-9, FIRST_TIME).masked_fill(time > LAST_TIME - 1e-9, LAST_TIME)
+    with torch.enable_grad():
+        moved = time.clone().requires_grad_()
+        slope = torch.autograd.grad(late(moved).sum(), moved)[0]
+    time = time - (late(time) / slope).masked_fill(stands_still, 0)
+
+    position, depth, jacobian = lens_points(None, first + time[:, None] * motion, settings)
+    # By the chain rule: the pixel p(x, t) also moves with the time t, which moves with p.
+    velocity = jacobian @ motion[:, :, None]
+    speed = length - sign * velocity[:, axis]
+    depth = depth.masked_fill(~stands_still & (speed[:, 0] < SHUTTER_SPEED_MIN * length), math.nan)
+    stretch = (sign * velocity @ jacobian[:, axis:axis + 1] / speed[:, None]).masked_fill(
+        stands_still[:, None, None], 0)
+    view, end = (matrix[:3, :3].T for matrix in (settings.viewmatrix, settings.viewmatrix_end))
+    return position, depth, jacobian + stretch, view + time[:, None, None] * (end - view)
 
 
 def _image(view, settings):

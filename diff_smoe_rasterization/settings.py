@@ -56,6 +56,9 @@ of its numbers, `fisheye` 0, 1, 2 or 4. COLMAP's OPENCV and FULL_OPENCV are `ope
 `fisheye`, with their numbers in the same order.
 """
 
+ROLLING_SHUTTERS = ("global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left")
+"""How an image is read out, by number in the C++ core: at once, or by rows or columns in this order."""
+
 _FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_eq7": None, "smoe_tn": 0.0, "smoe_std": 0.0}
 """The background's gate that a blend mode has by itself. None: the caller gives it."""
 
@@ -126,6 +129,10 @@ class GaussianRasterizationSettings(NamedTuple):
     distortion: Sequence[float] = ()  # as CAMERA_MODELS has them
     # pixels; the centre of the first pixel is (0.5, 0.5). None: of the image. A pinhole's is in `projmatrix`
     principal_point: Optional[Tuple[float, float]] = None
+    # One of ROLLING_SHUTTERS. But for "global", `viewmatrix` is the pose at the first row, or column, and
+    # `viewmatrix_end` that at the last. Then a pinhole needs `principal_point`, and `projmatrix` is not read
+    rolling_shutter: str = "global"
+    viewmatrix_end: Optional[torch.Tensor] = None  # [4, 4] transposed; differentiable
 
 
 class Rendering(NamedTuple):
@@ -226,7 +233,7 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
     """Returns the gate sum of near pairs below which a rendering in this blend mode counts faint pairs and tails.
 
-    None means that of the process, else the environment variable DSMOE_FAINT_BELOW, for callers that cannot be edited,
+    None means the process's value, else the environment variable DSMOE_FAINT_BELOW, for callers that cannot be edited,
     else the mode's own.
     Raises ValueError for what is not a number of 0 or more, or a greater one than MAX_BACKGROUND_GATE.
     """
@@ -259,10 +266,16 @@ def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:
 def resolve_lens(settings: GaussianRasterizationSettings) -> Tuple[int, List[float]]:
     """Returns the number of the camera model, and the principal point and distortion that the ops take.
 
-    Raises ValueError for a name that is not in CAMERA_MODELS, for what are no numbers, and for a pinhole with either.
-    The core refuses wrong counts and values.
+    With a rolling shutter a pinhole is `opencv` without distortion. Raises ValueError for a name that is not in
+    CAMERA_MODELS, for values that are not numbers, and for a pinhole that has or lacks them against its rule. The core
+    refuses wrong counts and values.
     """
     model, distortion, principal_point = settings.camera_model, settings.distortion, settings.principal_point
+    if model == "pinhole" and settings.rolling_shutter != "global" and len(distortion) == 0:
+        if principal_point is None:
+            raise ValueError(f"principal_point is None, but rolling_shutter is {settings.rolling_shutter!r}, with "
+                             "which projmatrix is not read; it must be given")
+        model = "opencv"
     if model == "pinhole":  # which every eager call of a trainer comes through
         if len(distortion) > 0:
             raise ValueError(f"distortion is {distortion!r}, but camera_model is 'pinhole'; name the lens that has it: "
@@ -275,15 +288,38 @@ def resolve_lens(settings: GaussianRasterizationSettings) -> Tuple[int, List[flo
         raise ValueError(f"camera_model is {model!r}; it must be one of {', '.join(CAMERA_MODELS)}")
     if principal_point is None:
         principal_point = (settings.image_width / 2, settings.image_height / 2)
-    numbers = []
-    for name, values in (("principal_point", principal_point), ("distortion", distortion)):
-        try:
-            numbers.append([float(value) for value in values])
-        except (TypeError, ValueError, RuntimeError):
-            raise ValueError(f"{name} is {values!r}; it must be a sequence of numbers") from None
-    if len(numbers[0]) != 2:
+    point = numbers_of("principal_point", principal_point)
+    if len(point) != 2:
         raise ValueError(f"principal_point is {principal_point!r}; it must be two numbers")
-    return CAMERA_MODELS.index(model), [*numbers[0], *numbers[1]]
+    return CAMERA_MODELS.index(model), [*point, *numbers_of("distortion", distortion)]
+
+
+def numbers_of(name: str, values: Any) -> List[float]:
+    """Returns numbers of a lens. Raises ValueError for what are none, and for tensors that require a gradient."""
+    try:
+        if isinstance(values, str):
+            raise TypeError
+        needs_gradient = any(getattr(value, "requires_grad", False) for value in values)
+        numbers = [float(value) for value in values] if not needs_gradient else []
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{name} is {values!r}; it must be a sequence of numbers") from None
+    if needs_gradient:
+        raise ValueError(f"{name} requires a gradient, but a lens has none; detach it")
+    return numbers
+
+
+def resolve_shutter(settings: GaussianRasterizationSettings) -> int:
+    """Returns the number of the rolling shutter.
+
+    Raises ValueError for a name that is not in ROLLING_SHUTTERS, and for a `viewmatrix_end` that does not fit it.
+    """
+    name = settings.rolling_shutter
+    if name not in ROLLING_SHUTTERS:
+        raise ValueError(f"rolling_shutter is {name!r}; it must be one of {', '.join(ROLLING_SHUTTERS)}")
+    if (name == "global") != (settings.viewmatrix_end is None):
+        given, should = ("given", "be None") if name == "global" else ("None", "be the pose at the last row or column")
+        raise ValueError(f"viewmatrix_end is {given}, but rolling_shutter is {name!r}; it must {should}")
+    return ROLLING_SHUTTERS.index(name)
 
 
 def _gated_names() -> str:

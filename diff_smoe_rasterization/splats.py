@@ -5,7 +5,7 @@ from typing import Any, Optional, Sequence
 
 import torch
 
-from .autograd import INPUTS, refuse_transforms  # which also registers the ops
+from .autograd import INPUTS, refuse_transforms, register_fake  # which also registers the ops
 from .checks import check_tensors
 from .settings import Contributions, GateMap, Importance
 
@@ -93,3 +93,17 @@ class Splats:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""
         culled = self._radii <= 0
         return values.masked_fill(culled if values.dim() == 1 else culled[:, None], 0)
+
+
+def _fake_contributions(pixel_weights, radii, *others):
+    def sums():
+        return pixel_weights.new_empty(radii.shape)
+
+    return sums(), torch.empty_like(radii), sums(), sums()
+
+
+register_fake("contributions", _fake_contributions)
+register_fake("importance", lambda pixel_weights, share_weights, color, gate_sum, bg, radii, *others: tuple(
+    pixel_weights.new_empty(radii.shape) for _ in range(3)))
+register_fake("gate_map", lambda gate_sum, radii, *others: tuple(
+    radii.new_empty(gate_sum.shape[1:]) for _ in range(3)))

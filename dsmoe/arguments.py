@@ -81,7 +81,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     scene = commands.add_parser("scene", help="make a scene of photographs",
                                 description="Finds where photographs were taken, by COLMAP, and writes a scene for "
-                                            "`dsmoe train`: images without lens distortion, cameras and points. It "
+                                            "`dsmoe train`: images, cameras and points. It "
                                             "needs pycolmap. Started again it goes on with what it has found.")
     scene.add_argument("photos", metavar="PHOTOS", help="folder of photographs; subfolders are read too")
     scene.add_argument("-o", "--output", metavar="SCENE", required=True,
@@ -91,6 +91,10 @@ def build_parser() -> argparse.ArgumentParser:
                             f"of a video; auto: all pairs of up to {choices.MOST_EXHAUSTIVE} (default: %(default)s)")
     scene.add_argument("--camera-model", choices=choices.CAMERA_MODELS, default=choices.CAMERA_MODEL,
                        help="of the lens, by COLMAP's names (default: %(default)s)")
+    scene.add_argument("--lenses", choices=choices.LENSES, default=choices.LENSES[0],
+                       help="undistort: images of a pinhole camera; native: the photographs as they are, with the lens "
+                            "that was found; auto: native where undistortion would cut off more than a tenth of a "
+                            "photograph (default: %(default)s)")
     scene.add_argument("--quiet", action="store_true", help="no progress bars")
 
     evaluate = commands.add_parser("eval", help="measure a trained run again",

@@ -6,7 +6,7 @@ import difflib
 import os
 import shlex
 import sys
-from typing import TYPE_CHECKING, Any, Dict, List, Optional
+from typing import TYPE_CHECKING, Any, Dict, List, Optional, Tuple
 
 from .arguments import build_parser, completion_script
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
@@ -21,6 +21,7 @@ from .system.process import command
 
 if TYPE_CHECKING:
     from .results.evaluation import Measure
+    from .scenes.layout import Layout
     from .system.group import Group
 
 
@@ -165,7 +166,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
         if not arguments.resume and getattr(arguments, "device", "auto") == "auto":
             arguments.device = "cuda"
             arguments.command_words += ["--device", "cuda"]
-    config = _train_config(arguments)
+    config, layout = _train_config(arguments)
     if gpus is not None:
         from .system.torchrun import chosen_gpus, launch, without_gpus
 
@@ -174,7 +175,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
     set_up_process(config.device)
     group = join_group(config.device)
     try:
-        _train_in(group, config, arguments)
+        _train_in(group, config, layout, arguments)
     except KeyboardInterrupt as stop:
         if group.leads:
             raise
@@ -189,14 +190,14 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
     return None
 
 
-def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) -> None:
+def _train_in(group: Group, config: TrainConfig, layout: Optional[Layout], arguments: argparse.Namespace) -> None:
     from .results.modelfile import model_path
     from .results.rows import blend_name, results_table, viewer_warning
     from .system.device import device_line
     from .train import train
 
     if not group.leads:
-        train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
+        train(config, arguments.resume, arguments.overwrite, progress=False, group=group, layout=layout)
         return
     print(device_line(config.device), flush=True)
     blend = blend_name(config.blend_mode, config.background_gate, config.unusual_faint)
@@ -215,7 +216,7 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
-                say=lambda text: print(text, flush=True))
+                say=lambda text: print(text, flush=True), layout=layout)
     print(results_table([row]))
     if row["psnr_train"] is not None:
         print(f"the training views have {row['psnr_train']:.2f} dB")
@@ -244,15 +245,22 @@ def _simplify(arguments: argparse.Namespace) -> None:
     print(results_table([row["start"], row]))
     if row["protocol"]["scene_kind"] == "model":
         print("measured against renderings of the model: there are no photographs")
+    if row["psnr"] is None and row["psnr_train"] is not None:
+        before = row["start"].get("psnr_train")
+        print(f"the training views have {row['psnr_train']:.2f} dB"
+              + ("" if before is None else f", and {before:.2f} dB before"))
     if viewer_warning(row):
         print(viewer_warning(row))
     path = model_path(arguments.output, row["protocol"]["iterations"])
     print(f"model: {printable(path)}, {os.path.getsize(path) / 1e6:.1f} MB of {row['start']['bytes'] / 1e6:.1f} MB")
-    print(f"for the web: {command()} export {shlex.quote(arguments.output)} -o model.spz")
+    # Viewers blend by alpha; to bake a model to that needs photographs.
+    bakes = row["blend_mode"] != "alpha" and row["protocol"]["scene_kind"] != "model"
+    web = "model.spz" if bakes or row["blend_mode"] == "alpha" else "model.html"
+    print(f"for the web: {command()} export {shlex.quote(arguments.output)}{' --bake alpha' * bakes} -o {web}")
 
 
-def _train_config(arguments: argparse.Namespace) -> TrainConfig:
-    """The options of a training: those that are given, and for --resume the run's own."""
+def _train_config(arguments: argparse.Namespace) -> Tuple[TrainConfig, Optional[Layout]]:
+    """The options of a training: those that are given, and for --resume the run's own; the scene's layout if read."""
     take_paper(arguments)
     given = given_options(arguments)
     if arguments.resume and set(given) & {"scene", "output"} == {"scene"}:  # dsmoe train --resume OUT
@@ -275,7 +283,7 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     if not arguments.resume or "scene" in given and (presets or not holds_run(run)):
         earlier_run = TrainConfig.load(run, continues=True) if arguments.resume and holds_run(run) else None
         return config_from_arguments(arguments, earlier_run)
-    return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
+    return TrainConfig.of_run(run, "SCENE", resumes=True, **given), None
 
 
 def _start_from(arguments: argparse.Namespace) -> None:
@@ -294,9 +302,10 @@ def _scene(arguments: argparse.Namespace) -> None:
 
     device = device_to_train_on()
     made = make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
-                      not arguments.quiet, say=lambda text: print(text, flush=True))
+                      not arguments.quiet, say=lambda text: print(text, flush=True), lenses=arguments.lenses)
     print(made)
-    print(f"to train on it: {train_command(arguments.output, 'MODEL', device, *made.size)}")
+    words = [train_command(arguments.output, 'MODEL', device, *made.size), *made.options]
+    print(f"to train on it: {' '.join(words)}")
 
 
 def _eval(arguments: argparse.Namespace) -> None:

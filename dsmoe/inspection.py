@@ -152,8 +152,8 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
 
     folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed; with
     `overwrite` any, whose files of the same names are replaced.
-    outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
-    depth in the scene's units, 0 if nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
+    outputs: "depth" and "alpha" are written beside each. NAME.depth.npy [H, W] float32 is the expected view depth in
+    the scene's units, 0 if nothing is hit. NAME.alpha.png has 8 bits, white where Gaussians cover.
 
     ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: what `open_run`
     opens of the run that config is of, whose record these two must not contradict. Raises TrainerError.
@@ -251,7 +251,7 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:
     """The cameras for a model: the test views of config.scene, else its training views, and their orbit.
 
-    The views are upright: photographs are often tilted.
+    The views are upright, since photographs are often tilted, and pinhole cameras.
 
     If the scene is not there, it is an orbit about the Gaussians and one camera on it. needed: raise TrainerError
     then.
@@ -259,6 +259,6 @@ def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> T
     if needed or is_folder(config.scene):
         every = load_cameras(config, "all")
         orbit = orbit_of_cameras(every)
-        return [upright(camera, orbit.up) for camera in load_cameras(config, "test") or every], orbit
+        return [upright(camera.pinhole(), orbit.up) for camera in load_cameras(config, "test") or every], orbit
     orbit = orbit_of_points(model.raw["means3D"].detach().cpu().double().numpy())
     return orbit.cameras(1, default_camera()), orbit

@@ -1,4 +1,4 @@
-"""Photographs to a scene: COLMAP, by pycolmap, finds where each was taken and removes the lens distortion."""
+"""Photographs to a scene: COLMAP, by pycolmap, finds where each was taken, and may remove the lens distortion."""
 from __future__ import annotations
 
 import contextlib
@@ -13,10 +13,17 @@ import urllib.parse
 from dataclasses import dataclass
 from typing import Any, Callable, List, Optional, Sequence, Tuple
 
+import numpy as np
+
+from diff_smoe_rasterization import io
+
 from .errors import SceneError, TrainerError, printable
-from .options.choices import CAMERA_MODEL, MATCHING, MOST_EXHAUSTIVE
+from .options.choices import CAMERA_MODEL, LENSES, MATCHING, MOST_EXHAUSTIVE
 from .options.early import FROM_VIDEO, VIDEO_ENDINGS, check_photos
-from .scenes.images import UNREADABLE, image_size, open_image
+from .scenes.cameras import Camera
+from .scenes.images import UNREADABLE, check_depth, image_size, open_image
+from .scenes.lens import MODELS, colmap_intrinsics
+from .scenes.undistortion import MOST_CUT, cut_off
 from .system.files import is_file, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.process import pip_install
@@ -26,11 +33,12 @@ SCENE = "dsmoe scene"  # in its folder's record
 WORK = "colmap"  # folder in the scene's: the database, which a second run goes on with
 DATABASE = "database.db"
 FEATURES = "photographs.json"  # of which photographs the database has features
-WRITTEN = ("images", "sparse/0", *(f"{WORK}/{name}" for name in ("models", "best", "undistorted")))
+WRITTEN = ("images", "sparse/0", *(f"{WORK}/{name}" for name in ("models", "best", "made")))
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
 MIN_PHOTOS = 3
 POLL_SECONDS = 0.5
+FISHEYE_FOCAL = 0.4  # of the longer side, where a photograph records none: 143 degrees. COLMAP's 1.2 are 48
 FOCAL_LENGTH, EXIF = 37386, 0x8769  # tags
 ADVICE = ("Neighbouring photographs should show two thirds of the same things, sharply, with texture, from places that "
           "differ: walk around, do not only turn the camera. ")
@@ -47,6 +55,7 @@ class Made:
     error: float  # mean reprojection error, pixels
     left_out: List[str]
     size: Tuple[int, int]  # width and height of its first image
+    options: Tuple[str, ...]  # of `dsmoe train`, without which it would do something else with the lens
 
     def __str__(self) -> str:
         more = ", ..." if self.left_out[3:] else ""
@@ -56,12 +65,13 @@ class Made:
 
 
 def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_model: str = CAMERA_MODEL,
-               progress: bool = True, say: Callable[[str], None] = lambda text: None) -> Made:
-    """Writes a COLMAP scene of the photographs in a folder: pinhole images, and where each was taken.
+               progress: bool = True, say: Callable[[str], None] = lambda text: None, lenses: str = LENSES[0]) -> Made:
+    """Writes a COLMAP scene of the photographs in a folder: the images, and where each was taken.
 
     matching: "exhaustive" compares all pairs, "sequential" neighbours by name, "auto" all pairs of up to
-    MOST_EXHAUSTIVE. say: is called with a line before each step. Raises SceneError, also if the photographs do not
-    connect, and TrainerError without pycolmap.
+    MOST_EXHAUSTIVE. say: is called with a line before each step. lenses: "undistort" writes images of a pinhole camera,
+    "native" the photographs with the lens that COLMAP found, "auto" these where undistortion would cut off much. Raises
+    SceneError, also if the photographs do not connect, and TrainerError without pycolmap.
     """
     names = photo_names(photos, output, say)
     for path in (photos, output, *names):
@@ -84,17 +94,49 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
         write_record(output, SCENE, Record(subject, earlier.files), earlier.files)
         pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # from now on it prints only errors
         best = _placed(pycolmap, photos, names, work, matching, camera_model, progress, say)
-        say("undistorting")
-        pinhole = os.path.join(work, "undistorted")
-        shutil.rmtree(pinhole, ignore_errors=True)
-        _while_counting(pycolmap, lambda token: pycolmap.undistort_images(
-            pinhole, os.path.join(work, "best"), photos, cancellation_token=token),
-            lambda: _count_files(os.path.join(pinhole, "images")), best.num_reg_images(), "undistortion", progress)
-        files = _taken_over(pinhole, output, subject, earlier.files)
+        placed = sorted(best.images[number].name for number in best.reg_image_ids())
+        found, made = os.path.join(work, "best"), os.path.join(work, "made")
+        cut = _cut_off(found)
+        keeps = lenses == "native" or lenses == "auto" and cut > MOST_CUT
+        shutil.rmtree(made, ignore_errors=True)
+        if keeps:
+            say(f"keeping the lens; without it {100 * cut:.0f} % of the pixels would be cut off")
+            _keep(photos, placed, found, made)
+        else:
+            say("undistorting")
+            _while_counting(pycolmap, lambda token: pycolmap.undistort_images(
+                made, found, photos, cancellation_token=token),
+                lambda: _count_files(os.path.join(made, "images")), len(placed), "undistortion", progress)
+        files = _taken_over(made, output, subject, earlier.files)
         write_record(output, SCENE, Record(subject, files), files)
-    placed = {best.images[number].name for number in best.reg_image_ids()}
     return Made(output, len(names), len(placed), best.num_points3D(), best.compute_mean_reprojection_error(),
-                sorted({*names} - placed), image_size(os.path.join(output, files[0])))
+                sorted({*names} - {*placed}), image_size(os.path.join(output, files[0])),
+                ("--lenses", "native") if keeps and cut <= MOST_CUT else ())
+
+
+def _cut_off(folder: str) -> float:
+    """The largest part of a camera's pixels that undistortion cuts off; 0 for models that only COLMAP undistorts."""
+    cut = 0.0
+    for camera in io.read_colmap(folder).cameras.values():
+        fx, fy, cx, cy, lens = colmap_intrinsics(camera) if camera.model in MODELS else (1.0, 1.0, 0.0, 0.0, None)
+        if lens:
+            pinhole = Camera("", np.eye(3), np.zeros(3), fx, fy, cx, cy, int(camera.width), int(camera.height))
+            cut = max(cut, cut_off(pinhole, lens))
+    return cut
+
+
+def _keep(photos: str, names: Sequence[str], found: str, made: str) -> None:
+    """Copies the photographs and COLMAP's model to where its undistortion has them in `made`. Raises SceneError."""
+    shutil.copytree(found, os.path.join(made, "sparse"))
+    for name in names:
+        source, target = os.path.join(photos, name), os.path.join(made, "images", name)
+        try:
+            with open_image(source) as file:
+                check_depth(file)
+        except UNREADABLE as error:
+            raise SceneError(f"{source}: cannot be kept as it is ({error}); or take --lenses undistort") from error
+        os.makedirs(os.path.dirname(target), exist_ok=True)
+        shutil.copyfile(source, target)
 
 
 def photo_names(folder: str, output: str, say: Callable[[str], None] = lambda text: None) -> List[str]:
@@ -136,6 +178,8 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
     one_camera = _are_of_one_camera(photos, names)
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
+    if "FISHEYE" in camera_model:
+        reader.default_focal_length_factor = FISHEYE_FOCAL
     mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
     say(f"finding features in {count} photographs of {'one camera' if one_camera else 'several cameras'}, on the "
         f"{'GPU' if pycolmap.has_cuda else 'CPU'}")

@@ -141,7 +141,7 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
     options.update(given)
     if given.get("strategy", STRATEGY) == STRATEGY:
         options = with_preset(options, "fast", device)
-        options.update(chosen_for_scene(unchecked_config(folder, options), given))
+        options.update(chosen_for_scene(unchecked_config(folder, options), given, layout))
     config = config_of(folder, options, given)
     chosen = {name: value for name, value in options.items() if name not in given}
     if chosen:

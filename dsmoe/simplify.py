@@ -3,9 +3,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from typing import Any, Callable, Dict, List, NamedTuple, Optional
 
-from .errors import ConfigError, TrainerError
+from .errors import ConfigError, SceneError, TrainerError
 from .inspection import open_renderer
 from .options.choices import SIMPLIFY_ITERATIONS
 from .options.config import TrainConfig, holds_run
@@ -22,6 +23,7 @@ from .train import earlier_files, train
 
 UNTIL = 0.35  # as with --fast: removals end at 0.95 of this part of the iterations, moves at 1.33 of it
 FIRST_POSITION_RATE = 0.000064  # times the scene extent: trained positions move little
+LEAST = 4  # Gaussians, as `importance` has it
 CHECKPOINT_EVERY = {"cpu": 1000, "cuda": 0}  # on a GPU a checkpoint takes longer than the steps that it would save
 # --loses tries these parts of the model, one after the other.
 FIRST_PART, STEP = 1 / 40, 1.5
@@ -66,7 +68,7 @@ def simplify(model: str, output: str, *, scene: Optional[str] = None, budget: Op
     if finds_center and resume and holds_run(output):
         config = config.changed(principal_point=TrainConfig.load(output).principal_point)
     earlier_files(config, resume, overwrite)
-    measured = _measure(config, start, say, progress, finds_center)
+    measured = _measure(config, start, say, progress, finds_center, found)
     if loses is None:
         row = train(measured.config, resume, overwrite, progress, scene=measured.scene, say=say)
     else:
@@ -84,7 +86,7 @@ def _config(model: str, found: Found, start: Start, given: Dict[str, Any]) -> Tr
     if start.blend_mode != "alpha" and mode != start.blend_mode:
         raise ConfigError(f"{model} is blended by {start.blend_mode}, and --blend-mode is {mode}; simplify it as it "
                           "is, then `dsmoe export OUT --bake alpha -o model.ply` makes an alpha model of it")
-    recorded = {**found.options, **({} if given.get("scene") else found.teacher)}
+    recorded = found.options_on(given.get("scene") or "")
     if mode != recorded.pop("blend_mode", mode):
         recorded.pop("background_gate", None)
     options = {**blend, **recorded, **given, "blend_mode": mode, "init": found.path}
@@ -104,7 +106,9 @@ def _budget(start: Start, budget: Optional[int], keep: Optional[float]) -> int:
     """How many Gaussians are to stay. Raises ConfigError."""
     if keep is not None and not 0 < keep <= 1:
         raise ConfigError(f"--keep is {keep}; it must be above 0 and at most 1, the part of the Gaussians that stay")
-    number = budget if budget is not None else max(4, round((keep or 1) * start.count))
+    number = budget if budget is not None else max(LEAST, round((keep or 1) * start.count))
+    if number < LEAST:
+        raise ConfigError(f"--budget is {number}; it must be at least {LEAST}")
     if number > start.count:
         raise ConfigError(f"--budget is {number}; it must be at most {start.count}, which {start.path} has: to grow "
                           f"it, `dsmoe train SCENE --init {start.path}`")
@@ -115,21 +119,30 @@ def _ladder(count: int) -> List[int]:
     """The budgets that --loses tries, rising, up to the model's own number."""
     budgets, part = [], FIRST_PART
     while part < 1:
-        budgets.append(max(4, round(part * count)))
+        budgets.append(max(LEAST, round(part * count)))
         part *= STEP
     return sorted({*budgets, count})
 
 
 def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], None]], progress: bool,
-             finds_center: bool) -> _Measured:
+             finds_center: bool, found: Found) -> _Measured:
     """Loads the scene, and looks whether the model shows it. Raises TrainerError.
 
     finds_center: whether the model may tell where its program had the principal points.
     """
     config.validate()
-    layout = read_layout(config)
+    try:
+        layout = read_layout(config)
+    except SceneError as error:
+        if not found.teacher or config.scene != found.options.get("scene"):
+            raise
+        raise SceneError(f"{error}; --scene {shlex.quote(str(found.teacher['scene']))} takes the model's renderings in "
+                         "place of photographs") from error
     scene = load_scene(dataclasses.replace(config, init=""), progress, layout).starting_with(start)
     if say:
+        if found.missing and scene.kind == "model":
+            say(f"note: the scene that its folder names, {found.missing}, is not there; the model's renderings take "
+                "the place of photographs, unless --scene names these")
         say(f"{start.path}: {start.count:,} Gaussians of SH degree {start.gaussians.sh_degree}, blend mode "
             f"{start.blend_mode}, {os.path.getsize(start.path) / 1e6:.1f} MB")
         say(describe_scene(scene, layout, config))
@@ -163,7 +176,8 @@ def _fewest(measured: _Measured, budgets: List[int], loses: float, resume: bool,
             after = train_psnr(open_renderer(config, path, None, device))
             lost = before - after
             if say:
-                say(f"{budget:,} Gaussians: {after:.2f} dB on the training images, {lost:.2f} dB less than the model")
+                than = f"{lost:.2f} dB less" if lost >= 0 else f"{-lost:.2f} dB more"
+                say(f"{budget:,} Gaussians: {after:.2f} dB on the training images, {than} than the model")
             if lost <= loses:
                 return row
             resume, overwrite = False, True
@@ -173,9 +187,12 @@ def _fewest(measured: _Measured, budgets: List[int], loses: float, resume: bool,
 
 def _figures(measured: _Measured) -> Dict[str, Any]:
     """The model's own, for the row."""
-    evaluation: Evaluation = evaluate(measured.renderer, measured.scene.to(measured.config.device).test,
-                                      measured.config.device, passes=1)
-    metrics = {name: None if measured.scene.kind == "model" else value for name, value in evaluation.metrics.items()}
+    scene = measured.scene.to(measured.config.device)
+    evaluation: Evaluation = evaluate(measured.renderer, scene.test, measured.config.device)
+    metrics = {name: None if scene.kind == "model" else value for name, value in evaluation.metrics.items()}
+    if not scene.test and scene.kind != "model":  # they alone tell what has changed
+        metrics["psnr_train"] = evaluate(measured.renderer, scene.train, measured.config.device, passes=1
+                                         ).metrics["psnr"]
     return {"blend_mode": measured.start.blend_mode, "background_gate": measured.start.background_gate,
             "protocol": {} if measured.start.faint_below is None else {"faint_below": measured.start.faint_below},
             **metrics, "num_gaussians": measured.start.count, "train_seconds": None, "fps": evaluation.fps,

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 LEAST_PSNR = 15.0  # of a model on its scene, dB: with less they do not belong together
 CHECKED_VIEWS = 16
 LEAST_ABOVE_BOUND = 1e-3  # a learned gate begins above its bound
-CLEARLY = 0.1  # dB: the principal points of a model's program are seen by it
+CLEARLY = 0.1  # dB of difference that show where a model's program had the principal points
 READERS = {".splat": splat_gaussians, ".spz": spz_gaussians, ".glb": glb_gaussians}
 
 
@@ -73,8 +73,16 @@ class Found:
     """Where a model lies."""
 
     path: str
-    options: Dict[str, Any] = field(default_factory=dict)  # of TrainConfig, that its folder records; `scene` too
+    options: Dict[str, Any] = field(default_factory=dict)  # of TrainConfig, that its folder records; a `scene` is there
     teacher: Dict[str, Any] = field(default_factory=dict)  # others in their place, for its renderings as the scene
+    missing: str = ""  # a scene that its folder names and that is not there
+
+    def options_on(self, scene: str) -> Dict[str, Any]:
+        """The options for a scene; empty: the one that the folder names, else the model's renderings."""
+        own = str(self.teacher.get("scene", ""))
+        if own and (os.path.realpath(scene) == os.path.realpath(own) if scene else "scene" not in self.options):
+            return {**self.options, **self.teacher}
+        return dict(self.options)
 
 
 class Quality(NamedTuple):
@@ -124,8 +132,10 @@ def _read_start(path: str, *_: int) -> Start:
             gaussians = read_ply(path)
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
-    except TrainerError:
-        raise
+    except TrainerError as error:
+        if "this is no PLY file" not in str(error) or ending == ".ply":
+            raise
+        raise TrainerError(f"{path}: it is none of .ply, .splat, .spz and .glb") from error
     except ValueError as error:
         raise TrainerError(f"{path}: {error}") from error
     count = len(gaussians.means3D)
@@ -150,10 +160,8 @@ def find_model(source: str) -> Found:
         raise TrainerError(f"{source}: no model is in it: neither {CONFIG_NAME} of `dsmoe train` nor point_cloud/"
                            "iteration_N/point_cloud.ply of 3DGS")
     options = _options_of_3dgs(source)
-    if is_folder(options.get("scene", "")):
-        return Found(path, options)
-    options.pop("scene", None)
-    return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {})
+    missing = "" if is_folder(options.get("scene", "")) else options.pop("scene", "")
+    return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {}, missing)
 
 
 def _found_run(folder: str) -> Found:
@@ -166,11 +174,13 @@ def _found_run(folder: str) -> Found:
     if config.background_gate != LEARNED:
         names += ["blend_mode", "background_gate"]
     options = {name: getattr(config, name) for name in names}
-    if is_folder(config.scene):
-        return Found(path, {**options, "scene": config.scene})
+    is_there = is_folder(config.scene)
+    if is_there:
+        options["scene"] = config.scene
     # Its cameras.json has those of the resized images.
     teacher = {"scene": folder, "resolution": 1, "principal_point": "scene", "lenses": TrainConfig().lenses}
-    return Found(path, options, teacher if is_file(os.path.join(folder, CAMERAS)) else {})
+    return Found(path, options, teacher if is_file(os.path.join(folder, CAMERAS)) else {},
+                 "" if is_there else config.scene)
 
 
 def _options_of_3dgs(folder: str) -> Dict[str, Any]:
@@ -243,7 +253,21 @@ def check_start(scene: Scene, config: TrainConfig) -> Quality:
         [dataclasses.replace(view, camera=camera) for view, camera in zip(views, centred)]))
     if max(quality.psnr, quality.centred) < LEAST_PSNR:
         raise TrainerError(f"{start.path} does not show {config.scene}: {there:.1f} dB on its images, and it must be "
-                           f"at least {LEAST_PSNR:g}. Is it another scene, are its poses others than those of the "
-                           "training (some programs move and scale them), or was its background white "
-                           "(--white-background)?")
+                           f"at least {LEAST_PSNR:g}. {_why_not_shown(scene, config)}")
     return quality
+
+
+def _why_not_shown(scene: Scene, config: TrainConfig) -> str:
+    """Questions of what differs from the training of the model to start from."""
+    assert scene.start is not None
+    questions = ["is it another scene", "are its poses others than those of the training (some programs move and scale "
+                 "them)", "was its background "
+                 + ("black (now it is white)" if config.white_background else "white (--white-background)")]
+    if any(view.camera.lens for view in scene.train):
+        questions.append("were its images undistorted (--lenses undistort)")
+    elif scene.note:
+        questions.append("was it trained on images as they are (--lenses native)")
+    if scene.start.gaussians.blend_mode is None:
+        questions.append("is it of another blend than alpha, which the file does not record")
+    text = ", ".join(questions[:-1]) + ", or " + questions[-1]
+    return text[0].upper() + text[1:] + "?"

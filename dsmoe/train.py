@@ -13,9 +13,10 @@ from .options.config import CHECKPOINT_NAME, CONFIG_NAME, TrainConfig, holds_run
 from .results.modelfile import FOLDER, model_path, save_model
 from .results.pictures import loss_plot
 from .results.rendering import Rasterize
-from .results.rows import RESULTS_NAME, result_row, write_results
+from .results.rows import RESULTS_NAME, read_results, result_row, write_results
 from .results.scalars import FOLDER as SCALARS_FOLDER
 from .results.scalars import Scalars, scalar_files
+from .scenes.layout import Layout
 from .scenes.modelfolder import CAMERAS, cameras_content
 from .scenes.scene import Scene, describe_scene, load_scene, read_layout
 from .starting import check_start
@@ -134,7 +135,11 @@ class Run:
                          trainer.evaluate_training_views(self.progress), gate)
         if not trainer.leads:
             return row
-        write_results(os.path.dirname(self._path(RESULTS_NAME)), [row])
+        folder = os.path.dirname(self._path(RESULTS_NAME))
+        for earlier in read_results(folder) if config.init else ():  # of a resumed run
+            if "start" in earlier:  # of `dsmoe simplify`
+                row["start"] = earlier["start"]
+        write_results(folder, [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
         views = [*trainer.scene.test, *trainer.scene.train]
         write_json_atomically(self._path(CAMERAS), cameras_content([view.camera for view in views]))
@@ -265,30 +270,32 @@ def room_text(trainer: Trainer) -> Optional[str]:
 
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
           scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None, group: Optional[Group] = None,
-          say: Optional[Callable[[str], None]] = None, lock: Optional[IO[str]] = None) -> Dict[str, Any]:
+          say: Optional[Callable[[str], None]] = None, lock: Optional[IO[str]] = None,
+          layout: Optional[Layout] = None) -> Dict[str, Any]:
     """Trains a scene into config.output; returns the row of results.json.
 
-    resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
-    of threads and the same SIMD level); start it if it has no checkpoint yet. With more iterations than it had, it
-    is extended: its milestones stay, and if it had ended it lacks the update of its last step. overwrite: replace a
-    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, if one is at
-    hand. group: the processes that train together, if there are several; all of them call this. say: is called
-    with a line about what was loaded; with it a training on the CPU also says how long it takes. lock: the folder's, if
-    the caller keeps it over several runs. Raises TrainerError
-    before training starts if anything does not fit, such as another run at work in the folder.
+    resume: continue the run in config.output; start it if it has no checkpoint yet. The result is bit for bit as if
+        it had not stopped (on the CPU, with the same number of threads and the same SIMD level). With more
+        iterations than it had, it is extended: its milestones stay, and if it had ended it lacks its last update.
+    overwrite: replace a run that is there, once this one can start; files that no run wrote stay.
+    scene: a loaded scene, if one is at hand. layout: what `read_layout` gave, likewise.
+    group: the processes that train together, if there are several; all of them call this.
+    say: is called with a line about what was loaded; with it a training on the CPU also says how long it takes.
+    lock: the folder's, if the caller keeps it over several runs.
+    Raises TrainerError before training starts if anything does not fit, such as another run at work in the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
     config.validate()
     check_device(config.device)
     if group and not group.leads:  # the folder is the first process's
-        run = Run(new_trainer(config, scene or load_scene(config, False), rasterize, group), progress=False)
+        run = Run(new_trainer(config, scene or load_scene(config, False, layout), rasterize, group), progress=False)
         room_text(run.trainer)
         if resume:
             run.resume()
         return run.train()
     earlier_files(config, resume, overwrite)
-    layout = None if scene else read_layout(config)
+    layout = None if scene else layout or read_layout(config)
     if config.init and layout and not resume:  # a model of another scene is told before a folder is made
         scene = load_scene(config, progress, layout)
         quality = check_start(scene, config)

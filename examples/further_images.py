@@ -2,18 +2,20 @@
 import argparse
 import os
 
-from render_ply import load, look_at, save
+from render_ply import ask_for_camera, check_seen, load, look_at, save
 
 from diff_smoe_rasterization import rasterize
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("model")
+ask_for_camera(parser)
 parser.add_argument("-o", "--output", default="images")
 arguments = parser.parse_args()
 
 gaussians, options = load(arguments.model)
-settings = look_at((2.7, 1.6, 0.3), (0.0, 0.6, 0.0), **options)
+settings = look_at(arguments.eye, arguments.target, **options)
 rendering = rasterize(settings=settings, outputs=("alpha", "depth", "inverse_depth"), **gaussians)
+check_seen(rendering)
 
 os.makedirs(arguments.output, exist_ok=True)
 save(rendering.color, os.path.join(arguments.output, "color.png"))

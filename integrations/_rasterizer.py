@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 import diff_smoe_rasterization
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
+from diff_smoe_rasterization.arguments import KINDS, fits
 from diff_smoe_rasterization.checks import check_tensor
 from diff_smoe_rasterization.learned_gate import gate_of
 from diff_smoe_rasterization.rasterizer import visible_radii
@@ -28,6 +29,33 @@ AXES = {"means3D": ("N", 3), "means2D": ("N", "D"), "means2D_densify": ("N", 3),
         "shs": ("N", "K", 3), "colors_precomp": ("N", "C"), "theta": (3,), "rho": (3,)}
 
 
+# Settings beside the package's own, by what they must be if they are not None.
+FLAGS = ("f_count", "get_flag", "include_mask", "include_feature")
+NUMBERS = ("kernel_size", "depth_threshold")
+TENSORS = ("subpixel_offset", "projmatrix_raw", "confidence")
+
+
+def check_own_settings(settings: Settings, num_gaussians: int) -> None:
+    """Raises ValueError or TypeError if one of the settings above is not what it must be."""
+    for names, kind in ((FLAGS, bool), (NUMBERS, float)):
+        for name in names:
+            value = getattr(settings, name, None)
+            if value is not None and not fits(kind, value):
+                raise ValueError(f"rasterize: {name} is {value!r}; it must be {KINDS[kind]}")
+    sizes = {"projmatrix_raw": 16, "confidence": num_gaussians}
+    for name in TENSORS:
+        value = getattr(settings, name, None)
+        if value is not None:
+            check_tensor("rasterize", name, value)
+            check_size(name, value, sizes.get(name, value.numel()))
+
+
+def check_size(name: str, tensor: torch.Tensor, size: int) -> None:
+    """Raises ValueError unless the tensor has so many elements."""
+    if tensor.numel() != size:
+        raise ValueError(f"rasterize: {name} has shape {list(tensor.shape)}; it must have {size} elements")
+
+
 def given_inputs(settings: Settings, inputs: Dict[str, Any]) -> Dict[str, Any]:
     """Returns the inputs with None for what is absent.
 
@@ -36,7 +64,8 @@ def given_inputs(settings: Settings, inputs: Dict[str, Any]) -> Dict[str, Any]:
     """
     means, checked = inputs["means3D"], {}
     check_tensor("rasterize", "means3D", means)
-    check_tensor("rasterize", "bg", settings.bg)
+    for name in ("bg", "viewmatrix", "projmatrix"):
+        check_tensor("rasterize", name, getattr(settings, name))
     _check_axes("bg", settings.bg, ("C",))
     for name, value in inputs.items():
         if value is not None:
@@ -201,6 +230,9 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
 
 def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torch.Tensor]) -> Settings:
     """Returns the settings with a camera that depends on theta and rho, at 0, to first order."""
+    if settings.rolling_shutter != "global":
+        raise NotImplementedError(f"rasterize: rolling_shutter is {settings.rolling_shutter!r}; theta and rho are "
+                                  "offered for 'global'")
     view = settings.viewmatrix  # transposed
     zero = view.new_zeros(3)
     x, y, z = (zero if theta is None else theta.reshape(3) - theta.reshape(3).detach()).unbind()
@@ -261,7 +293,7 @@ def visible_filter(self, means3D, scales=None, rotations=None, cov3D_precomp=Non
     """Returns the radii [N] int32 that a rendering would have, 0 for what the view does not see: a rasterizer's method.
 
     means3D: [N, 3]; scales [N, 3] with rotations [N, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]` are
-    taken as they are. Which radii are 0 depends on the blend mode: the anchors need that of their rendering.
+    taken as they are. Which radii are 0 depends on the blend mode: the anchors need the mode of their rendering.
     Raises ValueError or TypeError if arguments do not fit, as `rasterize` does.
     """
     return visible_radii(means3D, as_ours(self.raster_settings, {})[0], scales, rotations, cov3D_precomp)
@@ -290,6 +322,8 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
 
     def render(settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
         inputs = given_inputs(settings, inputs)
+        if new_settings:
+            check_own_settings(settings, len(inputs["means3D"]))
         densify = inputs.pop("means2D_densify", None)
         if densify is not None:  # one gradient of the image, which both receive
             inputs["means2D"] = densify if inputs["means2D"] is None else inputs["means2D"] + densify

@@ -45,8 +45,8 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
         g_indices: [N] int64, the row of scales and of rotations that a Gaussian has; not read if they are absent.
         scale_factors: [N, 1] or [N], what a Gaussian's scales are multiplied by, beside `scale_modifier`; absent: 1.
     The others are those of `diff_smoe_rasterization.rasterize`, and so are types, errors, and what is absent. An index
-    that is negative or beyond its codebook raises ValueError. The host looks for one when it meets a tensor of indices
-    for the first time, or changed, or with a codebook of another length; on a GPU it waits in that call, in no other.
+    that is negative or beyond its codebook raises ValueError. The host looks for one if a tensor of indices is new,
+    was changed, or meets a codebook of another length. On a GPU it waits in that call, in no other.
 
     Returns: color [C, H, W], radii [N] int32. Gradients equal bit for bit from run to run if those of `rasterize`
     do.
@@ -61,7 +61,7 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
             return None
         required(name, codebook)
         _check_indices(index_name, required(index_name, indices), count, name, codebook)
-        # On a GPU the gradient of index_select adds by atomics; that of an index sorts, which takes longer.
+        # On a GPU the gradient of index_select adds by atomics. The gradient of codebook[indices] sorts: it is slower.
         sorts = raster_settings.deterministic and codebook.is_cuda
         return codebook[indices] if sorts else codebook.index_select(0, indices)
 
@@ -95,7 +95,7 @@ _fitting = weakref.WeakValueDictionary()
 
 
 def _check_indices(name, indices, count, codebook_name, codebook):
-    """Raises unless each index is that of a row of the codebook, whose rows are its first axis."""
+    """Raises unless each index names a row of the codebook. Its rows are its first axis."""
     where = "rasterize_gaussians_indexed"
     if codebook.dim() != (3 if codebook_name == "shs" else 2):
         expected = {"shs": "[S, K, 3]", "scales": "[G, 3]", "rotations": "[G, 4]"}[codebook_name]

@@ -96,13 +96,12 @@ GSPLAT = (  # what its `rasterization` takes
     "means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree "
     "packed tile_size backgrounds render_mode sparse_grad absgrad rasterize_mode channel_chunk distributed "
     "camera_model segmented covars blend_mode background_gate faint_below radial_coeffs tangential_coeffs "
-    "thin_prism_coeffs").split()
+    "thin_prism_coeffs rolling_shutter viewmats_rs").split()
 # What it takes in later versions, with the values that switch them off. Callers spell those out.
 OF_LATER_GSPLAT = {
     "with_ut": False, "with_eval3d": False, "return_normals": False, "global_z_order": True, "rays": None,
-    "ftheta_coeffs": None, "lidar_coeffs": None, "external_distortion_coeffs": None, "rolling_shutter": None,
-    "viewmats_rs": None, "ut_params": None, "extra_signals": None, "extra_signals_sh_degree": None,
-    "renderer_config": None}
+    "ftheta_coeffs": None, "lidar_coeffs": None, "external_distortion_coeffs": None, "ut_params": None,
+    "extra_signals": None, "extra_signals_sh_degree": None, "renderer_config": None}
 
 CONTRACTS = (
     Contract("scaffold", "Scaffold-GS, Octree-GS, HAC, HAC++", signs=("calls visible_filter",),

@@ -4,8 +4,9 @@
 footprints; here they are exact.
 """
 from diff_smoe_rasterization import SparseGaussianAdam, rasterize_with_splats
+from diff_smoe_rasterization.checks import check_tensor
 
-from ._rasterizer import classes_of, results_of
+from ._rasterizer import check_size, classes_of, results_of
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "rasterize_gaussians"]
 
@@ -15,6 +16,8 @@ def _render(settings, inputs):
         color, radii = results_of(("color", "radii"), settings, inputs)
         return color, radii, radii.new_zeros(radii.shape)
     rendering, splats = rasterize_with_splats(settings=settings, **inputs)
+    check_tensor("rasterize", "metric_map", settings.metric_map)
+    check_size("metric_map", settings.metric_map, rendering.color[0].numel())
     counted = (settings.metric_map.reshape(rendering.color.shape[1:]) == 1).to(rendering.color.dtype)
     return rendering.color, rendering.radii, splats.contributions(counted).pixel_weights.round().to(rendering.radii)
 

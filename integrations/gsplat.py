@@ -7,7 +7,13 @@ import numpy as np
 import torch
 import torch.nn.functional as functional
 
-from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, reference, visible_radii
+from diff_smoe_rasterization import (
+    GaussianRasterizationSettings,
+    project_gaussians,
+    rasterize,
+    reference,
+    visible_radii,
+)
 from diff_smoe_rasterization.camera import clip_matrix
 from diff_smoe_rasterization.checks import checked_number
 from diff_smoe_rasterization.gaussians import divided
@@ -22,7 +28,9 @@ RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 EVERYTHING_NEARER = 1e10  # the far_plane that leaves nothing out
 CAMERA_MODELS = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
-GLOBAL_SHUTTER = "GLOBAL"  # the name of the other value of rolling_shutter that switches it off
+ROLLING_SHUTTERS = ("ROLLING_TOP_TO_BOTTOM", "ROLLING_LEFT_TO_RIGHT", "ROLLING_BOTTOM_TO_TOP", "ROLLING_RIGHT_TO_LEFT",
+                    "GLOBAL")
+"""The names of gsplat's RollingShutterType by their numbers."""
 
 
 def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Optional[torch.Tensor],
@@ -36,7 +44,8 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
                   segmented: bool = False, covars: Optional[torch.Tensor] = None, blend_mode: Optional[str] = None,
                   background_gate: Optional[BackgroundGate] = None, faint_below: Optional[float] = None,
                   radial_coeffs: Optional[torch.Tensor] = None, tangential_coeffs: Optional[torch.Tensor] = None,
-                  thin_prism_coeffs: Optional[torch.Tensor] = None,
+                  thin_prism_coeffs: Optional[torch.Tensor] = None, rolling_shutter: Any = None,
+                  viewmats_rs: Optional[torch.Tensor] = None,
                   **others: Any) -> Tuple[torch.Tensor, torch.Tensor, Dict[str, Any]]:
     """Renders N Gaussians with C cameras.
 
@@ -64,6 +73,9 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         radial_coeffs: [C, 6] k1 to k6 of a pinhole, or [C, 4] k1 to k4 of a fisheye. tangential_coeffs: [C, 2] p1, p2,
             and thin_prism_coeffs: [C, 4] s1 to s4, of a pinhole. The host reads all. The footprint is that of the
             affine approximation, not gsplat's unscented transform.
+        rolling_shutter: gsplat's RollingShutterType, or its number; None: GLOBAL.
+        viewmats_rs: [C, 4, 4] at the last row or column, where viewmats is at the first; differentiable. Matrices are
+            mixed linearly between them.
         blend_mode: one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha".
         background_gate: `smoe` and `smoe_eq7`: how much the background weighs, a number or a tensor of one element,
             which gets a gradient; None: $DSMOE_BACKGROUND_GATE, else 0.
@@ -120,10 +132,14 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
     shape = _shape(quats, scales, covars, count)
 
     model, distortions = _distortions(camera_model, num_cameras, radial_coeffs, tangential_coeffs, thin_prism_coeffs)
-    differentiable = [means, opacities, colors, viewmats, backgrounds, *shape.values()]
+    shutter = _shutter(rolling_shutter, viewmats_rs, viewmats)
+    rolls = shutter != "global"
+    differentiable = [means, opacities, colors, viewmats, backgrounds, *shape.values()] + [viewmats_rs] * rolls
     with_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in differentiable)
     projections = viewmats.transpose(1, 2) @ clip_matrix(Ks.detach(), width, height).transpose(1, 2).contiguous()
     centres = torch.inverse(viewmats)[:, :3, 3]
+    if rolls:
+        centres = (centres + torch.inverse(viewmats_rs)[:, :3, 3]) / 2
     intrinsics = Ks[:, :2].tolist()
     all_settings = [GaussianRasterizationSettings(
         image_height=height, image_width=width, tanfovx=width / (2 * focal_x), tanfovy=height / (2 * focal_y),
@@ -131,9 +147,13 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
         near=near_plane, blend_mode=blend_mode, background_gate=background_gate, low_pass=eps2d,
         faint_below=faint_below, camera_model=model, distortion=distortions[camera],
-        principal_point=None if model == "pinhole" else (center_x, center_y))
+        principal_point=None if model == "pinhole" and not rolls else (center_x, center_y),
+        rolling_shutter=shutter, viewmatrix_end=viewmats_rs[camera].T if rolls else None)
         for camera, ((focal_x, _, center_x), (_, focal_y, center_y)) in enumerate(intrinsics)]
-    means2d, depths = _image_points(means, viewmats, Ks, all_settings)
+    if rolls:
+        means2d, depths = _rolling_points(means, shape, all_settings)
+    else:
+        means2d, depths = _image_points(means, viewmats, Ks, all_settings)
     clips = far_plane < EVERYTHING_NEARER or radius_clip > 0
     if packed or clips:  # else the radii come with the images
         seen = torch.stack([visible_radii(means, settings, **shape) for settings in all_settings])
@@ -189,6 +209,34 @@ def _distortions(camera_model, num_cameras, radial, tangential, thin_prism):
     if camera_model == "fisheye":
         return "fisheye", [tuple(k) for k in columns[0]]
     return "opencv", [(*k[:2], *p, *k[2:], *s) for k, p, s in zip(*columns)]
+
+
+def _shutter(given, viewmats_rs, viewmats):
+    """Returns the shutter's name in the settings."""
+    name = "GLOBAL" if given is None else getattr(given, "name", given)
+    if isinstance(name, int) and 0 <= name < len(ROLLING_SHUTTERS):
+        name = ROLLING_SHUTTERS[name]
+    _check_choice("rolling_shutter", name, ROLLING_SHUTTERS)
+    if (name == "GLOBAL") != (viewmats_rs is None):
+        raise ValueError(f"rasterization: viewmats_rs is {'None' if viewmats_rs is None else 'given'}, but "
+                         f"rolling_shutter is {name}; it must be {'None' if name == 'GLOBAL' else 'given'}")
+    if viewmats_rs is not None:
+        _check_shape("viewmats_rs", viewmats_rs, tuple(viewmats.shape))
+        if viewmats_rs.dtype != viewmats.dtype:
+            raise TypeError(f"rasterization: viewmats_rs is {viewmats_rs.dtype}; it must be {viewmats.dtype}, as "
+                            "viewmats is")
+    return name.lower().replace("rolling_", "")
+
+
+@torch.no_grad()
+def _rolling_points(means, shape, all_settings):
+    """Returns what `_image_points` does, zeros of Gaussians that a camera does not see."""
+    nothing = means.new_zeros(len(means), 1)
+    prints = [project_gaussians(means, nothing, settings._replace(bg=nothing.new_zeros(1)), colors_precomp=nothing,
+                                **shape) for settings in all_settings]
+    unseen = torch.stack([each.radii == 0 for each in prints])
+    return (torch.stack([each.means2D + 0.5 for each in prints]).masked_fill(unseen[..., None], 0),
+            torch.stack([each.depths for each in prints]).masked_fill(unseen, 0))
 
 
 @torch.no_grad()
@@ -272,9 +320,7 @@ def _refuse_what_is_not_offered(others, **arguments):
     for name, value in others.items():
         if name not in OF_LATER_GSPLAT:
             raise TypeError(f"rasterization: there is no argument {name}")
-        off = OF_LATER_GSPLAT[name]
-        is_off = value is None or value is off or getattr(value, "name", None) == GLOBAL_SHUTTER
-        if not is_off:
+        if value is not None and value is not OF_LATER_GSPLAT[name]:
             raise NotImplementedError(f"rasterization: {name} is {value!r}; this module does not offer it")
 
 

@@ -1,7 +1,7 @@
 """Plans a patch, and makes it, shows it or takes it back. Everything is planned before anything is written.
 
-A plan is made of the files without what a patch put into them. So it is the same for a checkout that is patched, half
-patched by an interruption, or patched with other options, and to apply it is to write what differs from it.
+A plan is made of the files without what a patch put into them. So it is the same if the checkout is patched, half
+patched by an interruption, or patched with other options. To apply it is to write what differs from it.
 """
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ OF_PROCESS = re.compile(re.escape(UNFINISHED) + r"\w{8}\.(\d+)")  # the whole na
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
 CALLS = r"|\b(?:chosen_blend|default_(?:blend|smoe)|(?:saved_)?(?:blend|smoe)_of)\("  # nowhere imported without it
+TO_COMPILE = {"_gridencoder", "arithmetic", "tinycudann"}  # PyPI has none of them, or another's of that name
 PIP_NAMES = {"cv2": "opencv-python-headless", "PIL": "pillow", "skimage": "scikit-image", "sklearn": "scikit-learn",
              "yaml": "pyyaml"}  # of packages that are installed by another name
 PathLike = Union[str, Path]
@@ -180,6 +181,9 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 
 def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
     """Says what to do with a checkout that no patch fits."""
+    scripts = _training_scripts(files)
+    if scripts and all("/" in name for name in scripts):
+        return f"name the folder of the script that you run, such as {scripts[0].rpartition('/')[0]}"
     if not facts.calls_some(found) and not facts.importers(files):
         return ("name the folder in which train.py lies; a script of any other folder is run by "
                 "`dsmoe run --blend-mode smoe -- python SCRIPT ...`")
@@ -193,7 +197,13 @@ def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
 
 def _script_of(files: Mapping[str, bytes]) -> str:
     trains = [name for name, data in files.items() if b"def training(" in data and b"__main__" in data]
-    return min(trains or ["train.py"], key=lambda name: (name.count("/"), name != "train.py", name))
+    trains = trains or _training_scripts(files) or ["train.py"]
+    return min(trains, key=lambda name: (name.count("/"), name != "train.py", name))
+
+
+def _training_scripts(files: Mapping[str, bytes]) -> List[str]:
+    """Scripts that say by their name that they train."""
+    return [name for name, data in files.items() if "train" in name.rpartition("/")[2] and b"__main__" in data]
 
 
 def _by_run(files: Mapping[str, bytes]) -> str:
@@ -219,7 +229,9 @@ def _missing(files: Mapping[str, bytes], trainer: Trainer, options: Sequence[str
     ours = {path.name for path in STAND_INS.iterdir()}  # under --modernise
     own = {part.partition(".")[0] for name in files for part in name.split("/")} | {RASTERIZER}
     missing = {name for name in needed - own if importlib.util.find_spec(name) is None}
-    lines = {f"pip install {' '.join(PIP_NAMES.get(name, name) for name in sorted(missing - ours))}": missing - ours,
+    of_pip = missing - ours - TO_COMPILE
+    lines = {f"pip install {' '.join(PIP_NAMES.get(name, name) for name in sorted(of_pip))}": of_pip,
+             "compile what the trainer's page names": missing & TO_COMPILE,
              "--modernise brings this package's": missing & ours if "modernise" not in options else set()}
     return [f"not installed here: {', '.join(sorted(names))}; {remedy}" for remedy, names in lines.items() if names]
 

@@ -211,7 +211,7 @@ def _check_python(program: str, environment: Dict[str, str]) -> None:
 
 
 def _script(words: Sequence[str]) -> Optional[Path]:
-    """Returns the file that a command runs: the first .py, or that of `-m`; None if there is none."""
+    """Returns the file that a command runs: the first .py, or the file of `-m`; None if there is none."""
     modules = [after.replace(".", "/") + ".py" for word, after in zip(words, words[1:]) if word == "-m"]
     return next((Path(word).resolve() for word in [*words, *modules]
                  if word.endswith(".py") and Path(word).is_file()), None)
@@ -226,7 +226,7 @@ def _folders(script: Optional[Path]) -> List[Path]:
 def _read(folder: Path, everywhere: bool) -> Dict[str, bytes]:
     """Returns the Python files in a folder and two levels below it; {} if none imports a rasterizer.
 
-    everywhere: also if it is not a checkout like that of 3DGS.
+    everywhere: also if it is not a checkout like 3DGS's.
     """
     patterns = ("*.py", "*/*.py", "*/*/*.py") if everywhere or (folder / GR).is_file() else ()
     paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())

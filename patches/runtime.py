@@ -45,7 +45,7 @@ def _begin_gate(frozen: bool) -> None:
 
 
 def default_blend() -> Tuple[str, str]:
-    """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate: that of the mode."""
+    """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate, the mode's."""
     keep_records()
     _check_renderer()  # if only it was restored, the option would be recorded and ignored
     return resolve_blend_mode(None), ""
@@ -94,7 +94,7 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
 
     The blend mode PAPER stands for PAPER_PROGRAM. $DSMOE_FAINT_BELOW is recorded too.
 
-    A gate that is learned begins anew; under `of_saved` it is that of the model's file, and is never stepped.
+    A gate that is learned begins anew; under `of_saved` it is the model file's, and is never stepped.
 
     Notes them in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args.
     Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a

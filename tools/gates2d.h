@@ -5,8 +5,8 @@
 //   gated          C(x) = sum_i g_i c_i,   g_i = p_i G_i / sum_j p_j G_j      (Eq. 6, without opacity and depth)
 //   weighted sum   C(x) = sum_i G_i c_i
 //
-// The rasterizer's blend does not serve here: its cut at G < 1e-5 leaves a pixel to the background beyond 4.8 sigma,
-// while the sharp edge between two gates is made by tails far beyond. So exponents are kept as logarithms, and the
+// The rasterizer's blend does not serve here: by its cut at G < 1e-5 a pixel beyond 4.8 sigma is background. The sharp
+// edge between two gates is made by tails far beyond. So exponents are kept as logarithms, and the
 // gates are their softmax: no tail is too faint.
 //
 // Positions are in pixels divided by the longer side of the picture, so that all parameters are of one order.

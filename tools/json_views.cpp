@@ -53,6 +53,10 @@ struct Node {
 
   std::vector<double> numbers(std::size_t count) const {
     if (!json.is_array() || json.size() != count) fail("must be a list of " + std::to_string(count) + " numbers");
+    return numbers();
+  }
+  std::vector<double> numbers() const {
+    if (!json.is_array()) fail("must be a list of numbers, and is " + shown());
     std::vector<double> values;
     for (const Json& value : json) values.push_back(Node{value, place}.number());
     return values;
@@ -99,26 +103,55 @@ void set_pose(View& view, const Rotation& to_world, const Vector& position) {
   }
 }
 
+/// By the `camera_model` of transforms.json. find, has: for the keys of a frame.
+template <class Find, class Has>
+void set_distortion(View& view, const std::string& model, const Find& find, const Has& has) {
+  const bool is_fisheye = model == "OPENCV_FISHEYE", is_around = model == "EQUIRECTANGULAR";
+  const std::vector<std::string> perspectives = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"};
+  if (!is_fisheye && !is_around && std::find(perspectives.begin(), perspectives.end(), model) == perspectives.end()) {
+    find("camera_model")
+        .fail("must be OPENCV, OPENCV_FISHEYE, EQUIRECTANGULAR or a simpler one, and is " + io::printable(model));
+  }
+  bool bends = is_fisheye;
+  for (const char* key : {"k1", "k2", "p1", "p2", "k3", "k4"}) {
+    const double value = has(key) ? find(key).number() : 0;
+    const bool is_tangential = key[0] == 'p', is_fourth = key == std::string("k4");
+    if (value != 0 && (is_around || (is_fisheye ? is_tangential : is_fourth))) {
+      find(key).fail("must be 0 for `camera_model` " + model);
+    }
+    if (is_fisheye ? !is_tangential : !is_around && !is_fourth) view.distortion.push_back(value);
+    bends = bends || value != 0;
+  }
+  if (is_around) return;
+  view.model = is_fisheye ? LensModel::kFisheye : bends ? LensModel::kOpencv : LensModel::kPinhole;
+  if (!bends) view.distortion.clear();
+}
+
 /// A frame of transforms.json. Its camera axes are OpenGL's: y up, z backward.
 View transforms_view(const Node& file, const Node& frame, ImageSize size) {
   const auto has = [&](const char* key) { return frame.has(key) || file.has(key); };
   const auto find = [&](const char* key) { return frame.has(key) ? frame.at(key) : file.at(key); };
-  for (const char* key : {"k1", "k2", "k3", "k4", "p1", "p2"}) {
-    if (has(key) && find(key).number() != 0) find(key).fail("lens distortion cannot be rendered");
-  }
   View view;
   view.name = frame.at("file_path").text();
   if (!has("w") && size.width == 0) frame.fail("`w` and `h` are missing; --size WIDTHxHEIGHT says them instead");
   view.width = has("w") ? find("w").side() : size.width;
   view.height = has("w") ? find("h").side() : size.height;
-  if (has("fl_x")) {
+  const std::string model = has("camera_model")                                         ? find("camera_model").text()
+                            : file.has("is_fisheye") && file.json["is_fisheye"] == true ? "OPENCV_FISHEYE"
+                                                                                        : "OPENCV";
+  if (model == "EQUIRECTANGULAR") {
+    set_panorama(view);
+  } else if (has("fl_x")) {
     view.fx = find("fl_x").positive();
   } else {
     view.fx = view.width / (2 * std::tan(find("camera_angle_x").number(1 / kLargest, 3.1415) / 2));
   }
-  view.fy = has("fl_y") ? find("fl_y").positive() : view.fx;
-  view.cx = has("cx") ? find("cx").number() : view.width / 2.0;
-  view.cy = has("cy") ? find("cy").number() : view.height / 2.0;
+  if (model != "EQUIRECTANGULAR") {
+    view.fy = has("fl_y") ? find("fl_y").positive() : view.fx;
+    view.cx = has("cx") ? find("cx").number() : view.width / 2.0;
+    view.cy = has("cy") ? find("cy").number() : view.height / 2.0;
+  }
+  set_distortion(view, model, find, has);
 
   const Node pose = frame.at("transform_matrix");
   const std::vector<double> m = pose.matrix(4, 4);
@@ -131,12 +164,22 @@ View transforms_view(const Node& file, const Node& frame, ImageSize size) {
 /// An entry of cameras.json: position and rotation of the camera in the world.
 View inria_view(const Node& camera) {
   View view;
-  if (camera.has("camera_model"))
-    camera.at("camera_model").fail("must be absent: only pinhole cameras can be rendered");
   view.name = camera.at("img_name").text();
   view.width = camera.at("width").side(), view.height = camera.at("height").side();
   view.fx = camera.at("fx").positive(), view.fy = camera.at("fy").positive();
-  view.cx = view.width / 2.0, view.cy = view.height / 2.0;
+  view.cx = camera.has("cx") ? camera.at("cx").number() : view.width / 2.0;
+  view.cy = camera.has("cy") ? camera.at("cy").number() : view.height / 2.0;
+  if (camera.has("camera_model")) {
+    const std::string model = camera.at("camera_model").text();
+    const auto found = std::find(std::begin(kLensNames), std::end(kLensNames), model);
+    if (found == std::end(kLensNames)) {
+      std::string names;
+      for (const char* name : kLensNames) names += std::string(names.empty() ? "" : ", ") + name;
+      camera.at("camera_model").fail("must be one of " + names + ", and is " + io::printable(model));
+    }
+    view.model = static_cast<LensModel>(found - std::begin(kLensNames));
+  }
+  if (camera.has("distortion")) view.distortion = camera.at("distortion").numbers();
   const Node rotation = camera.at("rotation"), position = camera.at("position");
   const std::vector<double> r = rotation.matrix(3, 3);
   Rotation to_world;
@@ -167,6 +210,7 @@ std::vector<View> parse_json_views(std::string_view bytes, const std::string& fi
     const Node entry = {list.json[i], file + ": " + (is_list ? "camera " : "frame ") + std::to_string(i)};
     if (!entry.json.is_object()) entry.fail("must be an object");
     views.push_back(is_list ? inria_view(entry) : transforms_view(root, entry, size));
+    check_lens(views.back(), file);
   }
   return views;
 }

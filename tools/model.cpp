@@ -120,6 +120,7 @@ BlendRules<double> choose_blend(const io::GaussianModel& model, const std::strin
   }
   // A file that records no gate was trained without one.
   choice.background_gate = background_gate.value_or(model.background_gate.value_or(0));
+  if (model.faint_below && chosen == recorded) choice.faint_below = *model.faint_below;
   if (choice.mode == BlendMode::kSmoeEq7 && choice.background_gate == 1)
     choice = {};  // the family's member that alpha blending is
   return choice;

@@ -31,7 +31,7 @@ class CpuRenderer final : public Renderer {
     out.alpha.resize(pixels);
     if (options_.depth) out.depth.resize(pixels);
 
-    frame_.camera = pinhole_camera<float>(view);
+    frame_.camera = camera_of(view);
     frame_.images.color = out.color.data();
     frame_.images.gate_sum = out.alpha.data();
     frame_.images.depth = options_.depth ? out.depth.data() : nullptr;

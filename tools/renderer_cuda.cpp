@@ -87,10 +87,10 @@ class CudaRenderer final : public Renderer {
   Images render(const View& view) override {
     const auto pixels = static_cast<std::size_t>(view.width) * view.height;
     const DeviceArray<float> color(3 * pixels), alpha(pixels), depth(options_.depth ? pixels : 0);
-    const Camera<float> camera = pinhole_camera<float>(view);
+    const Camera<float> camera = camera_of(view);
     view_.fill(camera.view), projection_.fill(camera.projection), position_.fill(camera.position);
-    frame_.camera = {camera.width, camera.height, camera.tan_fov_x,  camera.tan_fov_y,
-                     camera.near,  view_.get(),   projection_.get(), position_.get()};
+    frame_.camera = {camera.width, camera.height,     camera.tan_fov_x, camera.tan_fov_y, camera.near,
+                     view_.get(),  projection_.get(), position_.get(),  camera.lens};
     frame_.images.color = color.get();
     frame_.images.gate_sum = alpha.get();
     frame_.images.depth = depth.get();

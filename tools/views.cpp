@@ -3,9 +3,11 @@
 #include <cmath>
 #include <filesystem>
 #include <map>
+#include <optional>
 #include <stdexcept>
 
 #include "dsmoe/covariance.h"
+#include "io/cursor.h"
 #include "io/file.h"
 
 namespace dsmoe::tools {
@@ -36,7 +38,46 @@ Vector translation_of(const std::array<double, 9>& r, const Vector& p) {
   return {-dot({r[0], r[1], r[2]}, p), -dot({r[3], r[4], r[5]}, p), -dot({r[6], r[7], r[8]}, p)};
 }
 
+/// The rasterizer's lens of a COLMAP camera; none for the models that it does not have.
+std::optional<LensModel> lens_model_of(const io::CameraModel& model) {
+  const std::string name = model.name;
+  if (name == "SIMPLE_PINHOLE" || name == "PINHOLE") return LensModel::kPinhole;
+  if (name == "THIN_PRISM_FISHEYE") return LensModel::kThinPrismFisheye;
+  if (name == "EQUIRECTANGULAR") return LensModel::kEquirectangular;
+  for (const char* perspective : {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}) {
+    if (name == perspective) return LensModel::kOpencv;
+  }
+  for (const char* fisheye :
+       {"SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}) {
+    if (name == fisheye) return LensModel::kFisheye;
+  }
+  return std::nullopt;
+}
+
 }  // namespace
+
+Camera<float> camera_of(const View& view) {
+  Camera<float> camera = pinhole_camera<float>(view);
+  LensCalibration lens{view.model, view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion};
+  camera.lens = lens_of(lens).as<float>();
+  return camera;
+}
+
+void set_panorama(View& view) {
+  constexpr double kPi = 3.14159265358979323846;
+  view.model = LensModel::kEquirectangular;
+  view.fx = view.width / (2 * kPi), view.fy = view.height / kPi;
+  view.cx = view.width / 2.0, view.cy = view.height / 2.0;
+}
+
+void check_lens(const View& view, const std::string& file) {
+  try {
+    camera_of(view);
+  } catch (const std::invalid_argument& error) {
+    const std::string reason = error.what();  // behind the name of the function
+    throw io::FormatError(file + ": " + io::printable(view.name) + ": " + reason.substr(reason.find(": ") + 2));
+  }
+}
 
 View resized(const View& view, int width, int height) {
   const double across = double(width) / view.width, down = double(height) / view.height;
@@ -58,25 +99,30 @@ std::vector<View> read_views(const std::string& path, ImageSize size) {
 std::vector<View> views_of(const io::ColmapModel& model, const std::string& folder) {
   std::map<std::uint32_t, const io::ColmapCamera*> cameras;
   for (const io::ColmapCamera& camera : model.cameras) {
-    const std::string name = camera.model->name;
-    if (name != "PINHOLE" && name != "SIMPLE_PINHOLE") {
-      throw io::FormatError(folder + ": camera " + std::to_string(camera.id) + " has the model " + name +
-                            "; only PINHOLE and SIMPLE_PINHOLE, without lens distortion, can be rendered "
-                            "(`colmap image_undistorter` makes such a scene)");
+    if (!lens_model_of(*camera.model)) {
+      throw io::FormatError(folder + ": camera " + std::to_string(camera.id) + " has the model " + camera.model->name +
+                            ", which cannot be rendered; `colmap image_undistorter` makes a PINHOLE of it");
     }
     cameras[camera.id] = &camera;
   }
   std::vector<View> views;
   for (const io::ColmapImage& image : model.images) {
     const io::ColmapCamera& camera = *cameras.at(image.camera_id);
-    const auto param = [&](std::size_t from_end) { return camera.params[camera.params.size() - from_end]; };
-    View view;  // SIMPLE_PINHOLE is f, cx, cy; PINHOLE fx, fy, cx, cy
+    View view;
     view.name = image.name;
+    view.model = *lens_model_of(*camera.model);
     view.width = static_cast<int>(camera.width), view.height = static_cast<int>(camera.height);
-    view.fx = camera.params[0], view.fy = param(3);
-    view.cx = param(2), view.cy = param(1);
+    if (view.model == LensModel::kEquirectangular) {
+      set_panorama(view);
+    } else {  // one or two focal lengths, cx, cy and the lens's numbers, as the rasterizer takes them
+      const auto focal_lengths = static_cast<std::size_t>(camera.model->num_focal_lengths);
+      view.fx = camera.params[0], view.fy = camera.params[focal_lengths - 1];
+      view.cx = camera.params[focal_lengths], view.cy = camera.params[focal_lengths + 1];
+      view.distortion.assign(camera.params.begin() + focal_lengths + 2, camera.params.end());
+    }
     view.rotation = rotation_matrix(image.qvec);
     view.translation = image.tvec;
+    check_lens(view, folder);
     views.push_back(view);
   }
   return views;

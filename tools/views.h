@@ -7,13 +7,25 @@
 #include <vector>
 
 #include "dsmoe/camera.h"
+#include "dsmoe/lens.h"
 #include "io/colmap.h"
 
 namespace dsmoe::tools {
 
 struct View : Pinhole {
   std::string name;
+  LensModel model = LensModel::kPinhole;
+  std::vector<double> distortion;  // of a lens, as LensCalibration has it
 };
+
+/// The camera that the rasterizer takes. Throws std::invalid_argument for what cannot be a lens.
+Camera<float> camera_of(const View& view);
+
+/// Gives a view of that size all directions.
+void set_panorama(View& view);
+
+/// Throws FormatError, with the file and the view's name, for what cannot be a lens.
+void check_lens(const View& view, const std::string& file);
 
 /// The same view at another image size; intrinsics scale with the axes.
 View resized(const View& view, int width, int height);
@@ -27,7 +39,7 @@ struct ImageSize {
 /// Throws io::IoError: file, place and reason.
 std::vector<View> read_views(const std::string& path, ImageSize size);
 
-/// Throws FormatError for cameras with lens distortion.
+/// Throws FormatError for camera models that no lens of the rasterizer is.
 std::vector<View> views_of(const io::ColmapModel& model, const std::string& folder);
 
 /// The bytes of a json file, which `file` names in errors: a list is a cameras.json, an object a transforms.json.

@@ -147,7 +147,7 @@ def plan(cells: List[Dict[str, Any]], done: Mapping[str, Row], absent: Sequence[
 
 
 def check_folder(suite: Suite, results: str) -> None:
-    """Raises BenchError if the folder has rows of another suite or of another protocol, or a row that is none."""
+    """Raises BenchError if the folder has rows of another suite or of another protocol, or a damaged row."""
     def parts(cell: Mapping[str, Any]) -> Dict[str, Dict[str, Any]]:
         """What must stay as it is of a scene or a method that is there already; others may be added."""
         return {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
@@ -181,9 +181,9 @@ def check_own(results: str) -> None:
 def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
     """Runs Snakemake, which inherits the lock and shares it with its cells (cell.py, --hold); returns its status.
 
-    However this process ends, Snakemake is killed, since on a signal that it can catch it waits for the cells that run
-    here. Those of a queue it is to cancel (is_queued): it gets one SIGINT. A second one would end it before it has, and
-    so would a SIGHUP; in a session of its own it does not get the terminal's.
+    However this process ends, Snakemake is killed: on a signal that it can catch it would wait for the cells that run
+    here. Cells of a queue it must cancel (is_queued), so it gets one SIGINT. A second one, or a SIGHUP, would end it
+    too early; in a session of its own it does not get the terminal's.
     """
     import fcntl
 

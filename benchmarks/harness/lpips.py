@@ -7,6 +7,7 @@ from typing import Callable, Dict, List, Sequence
 import numpy as np
 import torch
 
+from ..errors import TrainerError
 from ..system.process import pip_install
 from .names import VARIABLES, net_of
 
@@ -21,8 +22,27 @@ BLOCKS = {"alex": [[(11, 4, 2)], [(5, 1, 2)], [(3, 1, 1)], [(3, 1, 1)], [(3, 1, 
 POOLING = {"alex": [None, (3, 2), (3, 2), None, None], "vgg": [None, (2, 2), (2, 2), (2, 2), (2, 2)]}
 
 
+LEAST_SIDE = {"alex": 31, "vgg": 16}  # pixels: with less a pooling has nothing left
+
+
 def lpips_network(kind: str, device: str) -> Distance:
-    """LPIPS of a kind of LPIPS_KINDS. lpips_vgg_inria feeds [0, 1] into a network made for [-1, 1], as 3DGS does."""
+    """LPIPS of a kind of LPIPS_KINDS. lpips_vgg_inria feeds [0, 1] into a network made for [-1, 1], as 3DGS does.
+
+    The distance raises TrainerError for images that are too small.
+    """
+    distance, least = _distance(kind, device), LEAST_SIDE[net_of(kind)]
+
+    def checked(image: torch.Tensor, target: torch.Tensor) -> float:
+        height, width = image.shape[-2:]
+        if min(height, width) < least:
+            raise TrainerError(f"LPIPS by {net_of(kind)} needs images of at least {least}x{least} pixels, and one has "
+                               f"{width}x{height}")
+        return distance(image, target)
+
+    return checked
+
+
+def _distance(kind: str, device: str) -> Distance:
     net, normalise = net_of(kind), kind != "lpips_vgg_inria"
     if os.environ.get(VARIABLES[net]):
         return FileLpips(net, os.environ[VARIABLES[net]], normalise, device)
@@ -79,7 +99,7 @@ class FileLpips:
 
 
 def arrays_of(path: str) -> Dict[str, np.ndarray]:
-    """The arrays of a file, lin as [channels]. Raises OSError; ValueError if it is no such file."""
+    """The arrays of a file, lin as [channels]. Raises OSError; ValueError if it holds others."""
     try:
         with np.load(path) as file:
             return {name: file[name].reshape(-1) if name.startswith("lin") else file[name] for name in file.files}

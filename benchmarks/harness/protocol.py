@@ -55,7 +55,7 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
 
 
 def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Dict[str, Any]:
-    """The protocol of a row: that of the trainer's `result_row`, and the harness's. A checkout's notes win over it."""
+    """The protocol of a row: what the trainer's `result_row` says, and the harness. A checkout's notes win over it."""
     rules = {**RULES, "lpips": {row["kind"]: RULES["lpips"][row["kind"]] for row in lpips}}
     return {**measured, **rules, "images": config.images, "downscaler": downscaler(config, measured["downscaler"]),
             "sh_degree": config.sh_degree,

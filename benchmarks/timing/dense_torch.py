@@ -3,8 +3,8 @@
 A baseline for benchmarks only. It does the same work as the library, as well as plain torch allows: projection and
 depth order once, a list of exact bounding boxes for every 16x16 tile, separable terms evaluated on rows and columns
 before they meet, all of torch's threads. A tile's backward follows its forward at once, so no tile is evaluated twice
-and memory is for one tile only; the price is that the image gradient must be known beforehand, which a training loop
-could not promise. The formulas and thresholds are those of `diff_smoe_rasterization.reference`, which tests it.
+and memory is for one tile only. So the image gradient must be known beforehand, which a training loop could not
+promise. The formulas and thresholds are those of `diff_smoe_rasterization.reference`, which tests it.
 """
 from __future__ import annotations
 

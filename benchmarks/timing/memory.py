@@ -1,8 +1,8 @@
 """Memory beyond inputs, outputs and returned gradients: what the graph keeps, and the peak, per unit.
 
-Kept memory is read off the saved tensors. The peak also holds what no tensor shows (sort buffers, gradient records):
-it is the growth of the process's largest resident size, in fresh processes, over three scenes that are almost purely
-Gaussians, pixels and tile instances; three equations give bytes per Gaussian, per pixel and per instance.
+Kept memory is read off the saved tensors. The peak also holds what no tensor shows (sort buffers, gradient records). It
+is the growth of the process's largest resident size, in fresh processes. Three scenes are almost purely Gaussians,
+pixels and tile instances: three equations give bytes per Gaussian, per pixel and per instance.
 """
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def from_files(ply: str, scene: str, resolution: int) -> Model:
     model, _ = load_model(ply, "cpu")
     inputs = dict(means3D=model.raw["means3D"], opacities=model.opacities, scales=model.scales,
                   rotations=model.rotations, shs=torch.cat([model.raw["dc"], model.raw["shs"]], 1))
-    cameras = load_cameras(TrainConfig(scene=scene, resolution=resolution), "test")
+    cameras = [camera.pinhole() for camera in load_cameras(TrainConfig(scene=scene, resolution=resolution), "test")]
     return Model(ply, {name: tensor.detach().contiguous() for name, tensor in inputs.items()}, cameras)
 
 
@@ -106,8 +106,8 @@ def to_npz(model: Model, path: str) -> None:
 def synthetic(num_gaussians: int, width: int = 800, height: int = 533, seed: int = 0) -> Model:
     """Gaussians scattered through the view of one camera, as sizes, shapes and opacities of trained models scatter.
 
-    Depths are 2 to 10; on the image the median standard deviation is that of as many discs that tile it eight times,
-    axes differ by a median factor of about 3, and half of the opacities are below 0.3.
+    Depths are 2 to 10. On the image the median standard deviation is the one of as many discs that tile it eight times.
+    Axes differ by a median factor of about 3, and half of the opacities are below 0.3.
     """
     generator = torch.Generator().manual_seed(seed)
 

@@ -158,10 +158,22 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
     refuse_unless_positive(function, "camera.lens.focal.x", camera.lens.focal.x);
     refuse_unless_positive(function, "camera.lens.focal.y", camera.lens.focal.y);
   }
+  const int shutter = static_cast<int>(camera.shutter);
+  if (shutter < 0 || shutter >= kNumShutters) {
+    refuse(function, "camera.shutter (rolling_shutter) is ", shutter, "; it must be 0 to ", kNumShutters - 1);
+  }
+  const bool rolls = camera.shutter != Shutter::kGlobal;
+  if (rolls && pinhole) {
+    refuse(function, "camera.shutter is ", kShutterNames[shutter],
+           ", but camera.lens is a pinhole; it must be another lens, such as opencv without distortion");
+  }
   if constexpr (kOnHost<Frame>) {
     refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", camera.view);
     if (pinhole) {
       refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
+    }
+    if (rolls) {
+      refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view_end (viewmatrix_end)", camera.view_end);
     }
     const bool read = frame.inputs.dc != nullptr || frame.inputs.shs != nullptr;
     for (int i = 0; read && i < 3; ++i) refuse_unless_finite(function, "camera.position (campos)", camera.position, i);
@@ -169,6 +181,7 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
     refuse_null(function, "camera.view", camera.view, "[4, 4]", 1);
     refuse_null(function, "camera.projection", camera.projection, "[4, 4]", 1);
     refuse_null(function, "camera.position", camera.position, "[3]", 1);
+    if (rolls) refuse_null(function, "camera.view_end", camera.view_end, "[4, 4]", 1);
   }
 }
 
@@ -346,16 +359,13 @@ template <class Frame> void refuse_walk(const char* function, const Frame& frame
   refuse_null(function, "images.radii", frame.images.radii, "[N]", reads_radii ? count : 0);
 }
 
-template <class Frame, class S>
-void refuse_contributions(const char* function, const Frame& frame, const ContributionMap<S>& map) {
-  const int64_t count = frame.inputs.num_gaussians;
+// pass: of dsmoe/passes.
+template <class Frame, class Pass> void refuse_pass(const char* function, const Frame& frame, const Pass& pass) {
   refuse_walk(function, frame);
-  refuse_instance_sums(function, frame);
-  refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
-  refuse_null(function, "sums.pixel_weights", map.sums.pixel_weights, "[N]", count);
-  refuse_null(function, "sums.pixels", map.sums.pixels, "[N]", count);
-  refuse_null(function, "sums.blend_weights", map.sums.blend_weights, "[N]", count);
-  refuse_null(function, "sums.distances", map.sums.distances, "[N]", count);
+  if (Pass::template Sums<float>::kNum > 0) refuse_instance_sums(function, frame);
+  pass.arrays([&](const char* name, const void* array, const char* shape,
+                  int64_t size) { refuse_null(function, name, array, shape, size); },
+              frame.inputs.num_gaussians);
 }
 
 // A mode without a removal cost.
@@ -367,31 +377,13 @@ template <class Modes = BlendModes> void refuse_unremovable(const char* function
   });
 }
 
-template <class Frame, class S>
-void refuse_importance(const char* function, const Frame& frame, const ImportanceMap<S>& map) {
-  const int64_t count = frame.inputs.num_gaussians;
-  refuse_walk(function, frame);
+template <class Frame, class Pass> void refuse_importance(const char* function, const Frame& frame, const Pass& pass) {
   refuse_unremovable(function, frame.config.blend.mode);
-  refuse_instance_sums(function, frame);
+  refuse_pass(function, frame, pass);
   refuse_footprints(function, frame);
   refuse_null(function, "background", frame.config.background, "[C]", 1);
   refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", 1);
   refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", has_tails(frame.config.blend.mode));
-  refuse_null(function, "color", map.color, "[C, H, W]", 1);
-  refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
-  refuse_null(function, "share_weights", map.share_weights, "[H, W]", 1);
-  refuse_null(function, "sums.shares", map.sums.shares, "[N]", count);
-  refuse_null(function, "sums.squared_shares", map.sums.squared_shares, "[N]", count);
-  refuse_null(function, "sums.removal_costs", map.sums.removal_costs, "[N]", count);
-}
-
-template <class Frame> void refuse_gate_map(const char* function, const Frame& frame, const GateMap& map) {
-  refuse_walk(function, frame);
-  refuse_null(function, "gaussians", map.gaussians, "[H, W]", 1);
-  refuse_null(function, "counts", map.counts, "[H, W]", 1);
-  const bool median = map.medians != nullptr;
-  refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", median);
-  refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", median && has_tails(frame.config.blend.mode));
 }
 
 template <class Frame> void refuse_mark_visible(const char* function, const Frame& frame, const bool* visible) {

@@ -1,6 +1,7 @@
 """The passes of a step over a batch of views, with the Gaussians divided over the processes of a group."""
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Callable, Dict, Iterator, Optional, Sequence
 
 import torch
@@ -11,9 +12,35 @@ from ..results.rendering import Renderer
 from ..scenes.images import View
 from ..system.group import Group
 from ..training.gate import LearnedGate
-from ..training.passes import Compare, Passes, ViewOver
+from ..training.passes import Passes, add_gradient
+from ..training.step_parts import Compare, ViewOver
 from ..training.strategy import Look, Step, look_at
 from .batch import Batch
+
+
+@dataclass(repr=False)
+class BatchStep(Step):
+    """A step of `BatchPasses`."""
+
+    parts: Batch
+    optimizer: GaussianOptimizer
+    gate: Optional[LearnedGate]
+    dL_dgates: torch.Tensor  # [views] by the background's gate
+
+    @torch.no_grad()
+    def backward(self) -> None:
+        self.seen += zip(self.parts.backward(), self.parts.radii)
+        del self.parts  # which holds on to memory
+        if self.gate:
+            self.gate.gradient.copy_(sum(self.dL_dgates.unbind(), torch.zeros_like(self.loss)))
+
+    def add_gradient(self, name: str, number: float) -> None:
+        add_gradient(self.optimizer.model, name, number)
+
+    def update(self) -> None:
+        self.optimizer.step()
+        for tensor in self.optimizer.model.stored.values():  # the next gradients are not there beside these
+            tensor.grad = None
 
 
 class BatchPasses(Passes):
@@ -24,12 +51,11 @@ class BatchPasses(Passes):
         """wants_stop: whether this process was asked to stop; `asked` says whether one was, before the latest step."""
         super().__init__(model, optimizer, renderer, gate)
         self.group, self.wants_stop, self.asked = group, wants_stop, False
-        self._batch: Optional[Batch] = None
 
     @torch.no_grad()
     def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare, looked: Sequence[int] = ()) -> Step:
         settings = [self.renderer.settings_of(shown.view.camera, shown.background) for shown in views]
-        batch = self._batch = Batch(self.group, self.model, settings, note=int(self.wants_stop()))
+        batch = Batch(self.group, self.model, settings, note=int(self.wants_stop()))
         self.asked = any(batch.notes)
         # Losses, and gradients by the background's gate.
         numbers = torch.zeros(2, len(views), device=self.model.raw["means3D"].device)
@@ -52,8 +78,8 @@ class BatchPasses(Passes):
         for index in range(len(batch.rounds)):
             batch.send_back(index, blend(index))
         self.group.add_up(numbers)
-        losses, self._dL_dgates = numbers
-        step = Step(iteration, len(views), losses.mean(), self._add_gradient)
+        losses, dL_dgates = numbers
+        step = BatchStep(iteration, len(views), losses.mean(), batch, self.optimizer, self.gate, dL_dgates)
         if looked:
             step.looks += batch.looks(looks, looked)
         return step
@@ -70,16 +96,3 @@ class BatchPasses(Passes):
                 view, image = drawn
                 looks[view] = look_at(some[view], some[view].image, image.color, image.splats())
             yield from batch.looks(looks, range(len(some)))
-
-    @torch.no_grad()
-    def backward(self, step: Step) -> None:
-        batch, self._batch = self._batch, None  # it holds on to memory
-        assert batch is not None, "render comes first"
-        step.seen += zip(batch.backward(), batch.radii)
-        if self.gate:
-            self.gate.gradient.copy_(sum(self._dL_dgates.unbind(), torch.zeros_like(step.loss)))
-
-    def update(self) -> None:
-        self.optimizer.step()
-        for tensor in self.model.stored.values():  # the next gradients are not there beside these
-            tensor.grad = None

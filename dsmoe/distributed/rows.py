@@ -7,7 +7,7 @@ import torch
 
 from diff_smoe_rasterization.autograd import INPUTS
 from diff_smoe_rasterization.core import _core
-from diff_smoe_rasterization.footprints import GATE_NUMBERS, image_numbers, projection_arguments
+from diff_smoe_rasterization.footprints import GATE_NUMBERS, camera_tensors, image_numbers, projection_arguments
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -25,7 +25,7 @@ class ViewRows:
         for begin in range(0, len(settings), most):
             some = settings[begin:begin + most]
             inputs, options = projection_arguments(some[0], means3D, opacities, **tensors)
-            cameras = [tensor for each in some for tensor in (each.viewmatrix, each.projmatrix, each.campos)]
+            cameras = [tensor for each in some for tensor in camera_tensors(each)]
             images = [number for each in some for number in image_numbers(each)]
             self._arguments.append((*inputs, *options, True, cameras, images))
         self._present = [tensor is not None for tensor in inputs]
@@ -54,10 +54,10 @@ class ViewRows:
         return gates, features
 
     def backward(self, records: List[torch.Tensor]) -> Tuple[Dict[str, torch.Tensor], List[torch.Tensor]]:
-        """Gradients from those by the rows of each view, [M, 9].
+        """From gradients by the rows of each view, [M, 9], to those by the arguments.
 
-        Returns sums over the views in their order, by the names of the arguments, and of each view dL/dpixel times
-        (W / 2, H / 2), [N, 3], written where the radius is above 0.
+        Returns their sums over the views in order, by the arguments' names. And of each view dL/dpixel times (W / 2,
+        H / 2), [N, 3], written where the radius is above 0.
         """
         sums: Optional[List[torch.Tensor]] = None
         means2D: List[torch.Tensor] = []

@@ -72,7 +72,7 @@ class DividedShards(Shards):
         return self.group.all_rows(rows, self.counts)
 
     def decide(self, function: Callable[..., torch.Tensor], *values: torch.Tensor) -> torch.Tensor:
-        # By the first process's result: on a GPU a sum may be rounded otherwise in each.
+        # All take the first process's result: on a GPU each may round a sum otherwise.
         return self.group.of_first(function(*map(self.every, values)))
 
     def route(self, origins: torch.Tensor, places: torch.Tensor) -> Route:

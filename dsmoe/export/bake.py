@@ -84,7 +84,7 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
     """Fine-tunes the renderer's Gaussians to alpha, by config's scene and options on config.device.
 
     Gaussians are neither added nor removed. In a mode without a background gate the whole training is in alpha. run:
-    that of the model; a line says if the scene is not the one that it was trained on. Raises TrainerError.
+    the model's; a line says if the scene is not the one that it was trained on. Raises TrainerError.
     """
     mode, gate = renderer.blend_mode, float(renderer.background_gate)
     if not viewer_warning({"blend_mode": mode, "background_gate": gate}):

@@ -79,6 +79,7 @@ def glb_gaussians(content: bytes) -> Gaussians:
         blend = primitives[0]["extensions"][SPLATTING].get("extensions", {}).get(BLEND, {})
         arrays = {name: _read(document, binary, index) for name, index in primitives[0]["attributes"].items()
                   if name != "COLOR_0"}
+        _check_shapes(arrays)
         position, harmonics = arrays["POSITION"], []
         for degree in range(4):
             names = [f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{place}" for place in range(2 * degree + 1)]
@@ -106,8 +107,22 @@ def _read(document: Dict[str, Any], binary: bytes, index: int) -> np.ndarray:
     width = {name: width for width, name in TYPES.items()}[accessor["type"]]
     if accessor["componentType"] != FLOAT or view.get("byteStride", 4 * width) != 4 * width:
         raise ValueError("its Gaussians are not in float32 without gaps; only such are read")
-    offset = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    return np.frombuffer(binary, "<f4", accessor["count"] * width, offset).reshape(-1, width)
+    offset, count = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), accessor["count"]
+    if not (isinstance(count, int) and 0 <= count and 0 <= offset and offset + 4 * width * count <= len(binary)):
+        raise ValueError(f"accessor {index} has {count} rows of {width} numbers from byte {offset} on, but the file "
+                         f"holds {len(binary)} bytes of them (truncated file?)")
+    return np.frombuffer(binary, "<f4", count * width, offset).reshape(-1, width)
+
+
+def _check_shapes(arrays: Dict[str, np.ndarray]) -> None:
+    """Raises ValueError if an attribute of the Gaussians has not one row of the right width for each of them."""
+    widths = {"POSITION": 3, f"{SPLATTING}:ROTATION": 4, f"{SPLATTING}:SCALE": 3, f"{SPLATTING}:OPACITY": 1}
+    for name, array in arrays.items():
+        wanted = (len(arrays["POSITION"]), widths.get(name, 3))
+        if name in widths or name.startswith(f"{SPLATTING}:SH_DEGREE_"):
+            if array.shape != wanted:
+                raise ValueError(f"{name} has {array.shape[0]} rows of {array.shape[1]} numbers; it must have "
+                                 f"{wanted[0]} of {wanted[1]}")
 
 
 def _document(blend: Optional[Blend]) -> Dict[str, Any]:

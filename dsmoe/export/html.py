@@ -66,8 +66,8 @@ def page(gaussians: Gaussians, shown: Shown) -> str:
 def pack(gaussians: Gaussians) -> Tuple[int, bytes, bytes]:
     """The number of finite Gaussians, their records, and their spherical harmonics from degree 1 on.
 
-    Harmonics have 8 bits each and for each Gaussian one scale: float16 scale, then coefficients as multiples of
-    scale / 127, the three channels of each together, in a whole number of texels of 16 bytes.
+    Harmonics have 8 bits each, and each Gaussian one scale: float16 scale, then coefficients as multiples of
+    scale / 127. The three channels of each are together, in a whole number of texels of 16 bytes.
     """
     position, logit, log_scales, rotations, dc, harmonics = finite_rows(gaussians)
     records = np.zeros(len(position), RECORD)
@@ -91,7 +91,7 @@ def pack(gaussians: Gaussians) -> Tuple[int, bytes, bytes]:
 def _rotation_vectors(rotations: np.ndarray) -> np.ndarray:
     """[N, 3] x, y, z of unit quaternions with w as the largest component, for [N, 4] quaternions (w, x, y, z).
 
-    Times i, j or k a quaternion turns the Gaussian by half a turn about one of its own axes, which leaves it as it is,
+    Times i, j or k a quaternion turns the Gaussian by half a turn about one of its own axes. That leaves it as it is,
     and another component becomes w.
     """
     w, x, y, z = (rotations / np.linalg.norm(rotations, axis=1, keepdims=True).clip(1e-12)).T

@@ -8,8 +8,10 @@ from __future__ import annotations
 DEVICES = ("auto", "cpu", "cuda")  # a run knows the last two
 
 MATCHING = ("auto", "exhaustive", "sequential")  # of photographs; the first is the default
-CAMERA_MODELS = ("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # COLMAP's names
+CAMERA_MODELS = ("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE",
+                 "EQUIRECTANGULAR")  # COLMAP's names
 CAMERA_MODEL = "OPENCV"
+LENSES = ("auto", "undistort", "native")  # what becomes of distorted images; the first is the default
 MOST_EXHAUSTIVE = 200  # photographs, up to which `auto` compares all pairs
 
 ORBIT_FRAMES = 120

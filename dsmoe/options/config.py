@@ -22,7 +22,7 @@ from diff_smoe_rasterization.settings import (
 
 from ..errors import ConfigError
 from ..system.files import is_file, is_folder, write_text_atomically
-from .choices import DEVICES
+from .choices import DEVICES, LENSES
 from .importance_options import ImportanceOptions, parse_importance_options
 
 CONFIG_NAME = "config.json"
@@ -97,8 +97,9 @@ class TrainConfig:
         "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
         choices=PRINCIPAL_POINTS)
     lenses: str = _option(
-        "undistort", "undistort: images of distorted lenses and fisheyes become those of a pinhole, by OpenCV; native: "
-                     "they stay, and Gaussians are projected through the lens", choices=("undistort", "native"))
+        LENSES[0], "undistort: images of distorted lenses and fisheyes become those of a pinhole, by OpenCV; native: "
+                   "they stay, and Gaussians are projected through the lens; auto: native where undistortion would cut "
+                   "off more than a tenth of an image", choices=LENSES)
     test_every: int = _option(
         8, "every so many images, sorted by name, one is kept for testing, the first among them; 0: none. A scene that "
            "lists its test images itself keeps those")
@@ -404,8 +405,8 @@ class TrainConfig:
         """Raises ConfigError if `later` cannot continue this run. Comes before `validate`, which knows no run."""
         differences = self.differences(later)
         if differences:
-            raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `--resume -o "
-                              f"{self.output}` alone keeps the run's options; more --iterations extend it")
+            raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `dsmoe train "
+                              f"--resume -o {self.output}` keeps the run's options; more --iterations extend it")
 
 
 def _recipe_of(strategy: str) -> Dict[str, Any]:

@@ -3,13 +3,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from typing import Any, Callable, Dict, Optional, Sequence, Union
+from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Sequence, Tuple, Union
 
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, PAPER_PROGRAM
 
 from ..errors import ConfigError
 from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
 from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, with_preset
+
+if TYPE_CHECKING:
+    from ..scenes.layout import Layout
 
 # How `--help` groups the options; those that no group names are of the last one.
 GROUPS = {
@@ -97,8 +100,11 @@ def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
     return {name: value for name, value in vars(arguments).items() if name in names}
 
 
-def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
+def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None
+                          ) -> Tuple[TrainConfig, Optional[Layout]]:
     """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
+
+    Also returns the scene's layout, if it was read.
 
     With the strategy importance, the default, and with --scale-recipe the milestones that are not given keep their
     share of the iterations. importance also chooses by the scene (`presets.py`). earlier: the run that goes on with
@@ -108,7 +114,7 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
     preset = next((name for name in PRESETS if getattr(arguments, name, False)), None)
     options = with_preset(given, preset, given.get("device", "cpu"))
     config = TrainConfig(**options)
-    chooses = config.strategy == STRATEGY
+    chooses, layout = config.strategy == STRATEGY, None
     if chooses or getattr(arguments, "scale_recipe", False):
         config = dataclasses.replace(config.shortened(), **options)
     if chooses and earlier:
@@ -116,11 +122,16 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
         config = dataclasses.replace(config, **{name: getattr(earlier, name) for name in kept})
     elif chooses:
         dataclasses.replace(config, budget=config.budget or NUMBERS[config.device].least).validate()  # before it reads
-        config = dataclasses.replace(config, **chosen_for_scene(config, given))
+        from diff_smoe_rasterization.extension import BACKENDS  # noqa: F401  (says if nothing was built)
+
+        from ..scenes.scene import read_layout
+
+        layout = read_layout(config)
+        config = dataclasses.replace(config, **chosen_for_scene(config, given, layout))
     if earlier:
         earlier.check_continued_by(config)
     _check_learned(config, given)
-    return config.validate()
+    return config.validate(), layout
 
 
 def _check_learned(config: TrainConfig, given: Dict[str, Any]) -> None:

@@ -1,10 +1,13 @@
 """What `dsmoe train` chooses where nothing is given: how many Gaussians, and the presets `--fast` and `--best`."""
 from __future__ import annotations
 
-from typing import Any, Collection, Dict, NamedTuple, Optional
+from typing import TYPE_CHECKING, Any, Collection, Dict, NamedTuple, Optional
 
 from ..errors import ConfigError
 from .config import TrainConfig
+
+if TYPE_CHECKING:
+    from ..scenes.layout import Layout
 
 STRATEGY = "importance"
 
@@ -56,15 +59,14 @@ def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Di
             "strategy_options": ",".join(filter(None, [given, *settings]))}
 
 
-def chosen_for_scene(config: TrainConfig, given: Collection[str]) -> Dict[str, Any]:
-    """Options that depend on the scene, of those whose names are not given. Raises SceneError if it cannot be read."""
-    from ..scenes.scene import read_layout
+def chosen_for_scene(config: TrainConfig, given: Collection[str], layout: Layout) -> Dict[str, Any]:
+    """Options that depend on the scene, of those whose names are not given. layout: the scene's."""
     from ..starting import read_start
     from ..training.importance_strategy import reached_from
 
     if config.init:  # it keeps its number
         return {} if config.budget else {"budget": read_start(config.init).count}
-    layout, numbers = read_layout(config), NUMBERS[config.device]
+    numbers = NUMBERS[config.device]
     chosen: Dict[str, Any] = {}
     points = len(layout.points.subset(config.init_points, config.seed).positions)
     if layout.points.measured and "init_points" not in given and points > numbers.most_points:

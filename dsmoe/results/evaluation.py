@@ -54,8 +54,8 @@ def rows_of_views(render: Callable[[Sequence[View]], Dict[int, torch.Tensor]], b
                   agreed: Callable[[float], float] = float) -> List[Dict[str, Any]]:
     """What `summary` takes. `evaluate` says what is timed; a view's time is its share of its batch's.
 
-    render: the images of a batch by their index in it, all or some. agreed: from the seconds that one process has
-    rendered to those by which all decide on a further pass.
+    render: the images of a batch by their index in it, all or some. agreed: from the seconds that one process
+    has rendered to the seconds by which all decide on another pass.
     """
     rows: List[List[Dict[str, Any]]] = []  # of each batch
     seconds: List[List[float]] = []  # of each batch, in each pass
@@ -88,7 +88,7 @@ def rows_of_views(render: Callable[[Sequence[View]], Dict[int, torch.Tensor]], b
 def summary(per_view: List[Dict[str, Any]]) -> Evaluation:
     """Means of what was measured of each view. A metric that is None for some views is the mean over the others.
 
-    Raises TrainerError for a rendering that has NaN or infinite pixels: its figures would be none.
+    Raises TrainerError for a rendering that has NaN or infinite pixels, which cannot be measured.
     """
     for row in per_view:
         if math.isnan(row["psnr"]):

@@ -73,8 +73,14 @@ def read_ply(path: str) -> io.Gaussians:
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
-        other = "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
-        raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
+        text = str(error)
+        other = ("; it is compressed, as SuperSplat does: let that write a .ply that is not"
+                 if "packed_position" in text else
+                 "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
+                 if "no scalar property" in text else
+                 "; `dsmoe simplify` and `dsmoe train --init` read such files, other commands a .ply"
+                 if path.lower().endswith((".splat", ".spz", ".glb")) else "")
+        raise TrainerError(text + other) from error
 
 
 def recorded_of(path: str, stored: io.Gaussians) -> Recorded:

@@ -59,7 +59,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["images_left_out"] = scene.missing
     if scene.note:
         unusual["undistortion"] = "by OpenCV, bicubic; focal lengths, principal points and sizes stay"
-    if config.lenses == "native":
+    if any(view.camera.lens for view in views):
         unusual["lenses"] = "native"
     if any(view.mask is not None for view in views):
         unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"

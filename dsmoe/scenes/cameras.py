@@ -49,6 +49,13 @@ class Camera:
         """The same view with the principal point moved to the image centre."""
         return dataclasses.replace(self, cx=self.width / 2, cy=self.height / 2)
 
+    def pinhole(self) -> Camera:
+        """The same view by a pinhole; in place of a lens, whose image it may not have, of 90 degrees across at most."""
+        if not self.lens:
+            return self
+        factor = max(1.0, self.width / 2 / self.fx)
+        return dataclasses.replace(self, lens=None, fx=factor * self.fx, fy=factor * self.fy)
+
     def settings(self, background: torch.Tensor, sh_degree: int, blend_mode: str,
                  antialiasing: bool = False, scale_modifier: float = 1.0,
                  dtype: Optional[torch.dtype] = None) -> GaussianRasterizationSettings:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import io
 import os
@@ -119,10 +120,10 @@ def load_view(posed: PosedImage, config: TrainConfig, checksum: bool) -> View:
     except UNREADABLE as error:
         raise unreadable(posed.path, error, bool(posed.made_from)) from error
     camera = fitted_camera(posed, image.size, config)
-    mask = None
+    mask = shown_by_lens(camera)
     if posed.mask is not None:
         own = read_mask(read(posed.mask), posed.mask, posed.path, image.size, bool(posed.made_from))
-        mask = _fitted_mask(own, posed, camera)
+        mask = _fitted_mask(own, posed, camera, mask)
     try:
         return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask,
                     hashed.hexdigest() if hashed else "")
@@ -162,9 +163,25 @@ def read_mask(content: bytes, path: str, image_path: str, size: Tuple[int, int],
     return mask
 
 
-def _fitted_mask(mask: Image.Image, posed: PosedImage, camera: Camera) -> torch.Tensor:
-    """[1, H, W] uint8: the mask in the camera's size."""
+def shown_by_lens(camera: Camera) -> Optional[torch.Tensor]:
+    """[1, H, W] uint8: 255 where the camera's lens shows something, and 0 beyond; None if nothing is beyond."""
+    return _reached(dataclasses.replace(camera, name="", rotation=None, translation=None)) if camera.lens else None
+
+
+@functools.lru_cache(maxsize=4)
+def _reached(camera: Camera) -> Optional[torch.Tensor]:
+    """As `shown_by_lens`; without pose, so that images of one camera share it."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    reached = x**2 + y[:, None] ** 2 < camera.lens.reach**2
+    return None if reached.all() else torch.from_numpy(reached.astype(np.uint8) * 255)[None]
+
+
+def _fitted_mask(mask: Image.Image, posed: PosedImage, camera: Camera, shown: Optional[torch.Tensor]) -> torch.Tensor:
+    """[1, H, W] uint8: the mask in the camera's size; 0 where `shown` [1, H, W] is 0."""
     planes = _planes(mask, camera, Image.BILINEAR)  # which does not overshoot at edges
+    if shown is not None:
+        planes = torch.minimum(planes, shown)
     if not bool(planes.any()):
         raise SceneError(f"{posed.mask}: the mask keeps no pixel of {posed.path}; white is what counts, black is "
                          "ignored")

@@ -77,6 +77,17 @@ def without_missing(folder: str, layout: Layout, strict: bool) -> Layout:
     return dataclasses.replace(layout, train=train, test=test, missing=[image.camera.name for image in missing])
 
 
+def check_lenses(folder: str, layout: Layout) -> None:
+    """Raises SceneError for a lens that cannot be that of its image."""
+    for image in [*layout.train, *layout.test]:
+        camera = image.camera
+        try:
+            if image.lens:
+                image.lens.check(max(camera.fx, camera.fy), camera.width, camera.height)
+        except ValueError as error:
+            raise SceneError(f"scene {folder}: {camera.name}: {error}") from error
+
+
 def with_lenses(layout: Layout) -> Layout:
     """The layout with each image's lens in its camera, so that nothing is to be undistorted."""
     def native(image: PosedImage) -> PosedImage:

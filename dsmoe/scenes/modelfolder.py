@@ -81,6 +81,8 @@ def _camera(entry: Any) -> Camera:
     if not (min(numbers[:2]) > 0 and min(width, height) > 0):
         raise ValueError(f"`width`, `height`, `fx` and `fy` of {entry['img_name']} must be above 0")
     lens = lens_named(entry["camera_model"], entry.get("distortion", ())) if "camera_model" in entry else None
+    if lens:
+        lens.check(max(numbers[:2]), width, height)
     return Camera(str(entry["img_name"]), turn.T, -turn.T @ place, *numbers, width, height, lens)
 
 

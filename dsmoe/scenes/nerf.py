@@ -20,7 +20,7 @@ from ..system.files import is_file
 from .cameras import LARGEST, Camera
 from .images import image_size
 from .layout import Layout, PosedImage, hold_out
-from .lens import AROUND, Lens, lens_of
+from .lens import AROUND, FISHEYE, PERSPECTIVE, Lens, lens_of
 from .orbit import orbit_of_cameras
 from .pointcloud import SH_C0, PointCloud
 
@@ -139,7 +139,7 @@ def _read_json(path: str) -> Dict[str, Any]:
 
 
 def _image_path(folder: str, name: str) -> str:
-    """Without an ending it is that of the file that is there, else .png."""
+    """A path without an ending gets the ending of the file that is there, else .png."""
     path = os.path.join(folder, name)
     if os.path.splitext(path)[1]:
         return path
@@ -218,16 +218,15 @@ def _lens(model: Any, is_fisheye: bool, coefficients: Dict[str, float], where: s
     """The lens of a frame by its `camera_model`, which instant-ngp's `is_fisheye` stands for. Raises SceneError."""
     if model is None:
         model = "OPENCV_FISHEYE" if is_fisheye else "OPENCV"
-    if model == "OPENCV_FISHEYE":
-        return lens_of(model, True, coefficients)
-    if model == AROUND:
-        return Lens(AROUND, False, ())
-    if model not in PERSPECTIVE_MODELS:
+    if model not in (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE", AROUND):
         raise SceneError(f"{where}: `camera_model` is {reprlib.repr(model)}; it must be one of "
                          f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE, {AROUND}")
-    if coefficients.pop("k4"):
-        raise SceneError(f"{where}: `k4` is of a fisheye's lens; `camera_model` {model} must have 0 there")
-    return lens_of(model, False, coefficients)
+    known = () if model == AROUND else FISHEYE if model == "OPENCV_FISHEYE" else PERSPECTIVE[:5]
+    unknown = next((key for key, value in coefficients.items() if value and key not in known), None)
+    if unknown:
+        raise SceneError(f"{where}: `{unknown}` is {coefficients[unknown]:g}; a lens of `camera_model` {model} has "
+                         f"{' '.join(known) or 'no distortion'}, so it must be 0")
+    return Lens(AROUND, False, ()) if model == AROUND else lens_of(model, model == "OPENCV_FISHEYE", coefficients)
 
 
 def _focal(content: Dict[str, Any], frame: Dict[str, Any], width: int, where: str) -> float:

@@ -32,14 +32,8 @@ class Orbit:
         return self.target + along + np.cos(angles) * out + np.sin(angles) * side
 
     def cameras(self, count: int, like: Camera) -> List[Camera]:
-        """Pinhole cameras on the ring, with the size and the focal length of another and a centred principal point.
-
-        Of one with a lens, whose image a pinhole may not have, the focal length is at least half the width.
-        """
-        centred = like.centred()
-        if centred.lens:
-            factor = max(1.0, centred.width / 2 / centred.fx)
-            centred = dataclasses.replace(centred, lens=None, fx=factor * centred.fx, fy=factor * centred.fy)
+        """Pinhole cameras on the ring, with the size and the focal length of another and a centred principal point."""
+        centred = like.centred().pinhole()
         cameras = []
         for index, eye in enumerate(self.eyes(count)):
             rotation = look_at(eye, self.target, self.up)

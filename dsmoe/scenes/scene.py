@@ -22,12 +22,12 @@ from ..system.files import is_file, is_folder
 from ..system.process import command
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
-from .images import MAX_WIDTH, View, fitted_camera, load_views, size_of_image
-from .layout import Layout, PosedImage, with_lenses, with_masks, without_missing
+from .images import MAX_WIDTH, View, fitted_camera, load_views, shown_by_lens, size_of_image
+from .layout import Layout, PosedImage, check_lenses, with_lenses, with_masks, without_missing
 from .modelfolder import CAMERAS, read_model_layout, rendered_views
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
-from .undistortion import undistorted
+from .undistortion import trains_natively, undistorted
 
 if TYPE_CHECKING:
     from ..starting import Start
@@ -112,12 +112,14 @@ def read_layout(config: TrainConfig) -> Layout:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split}); "
                          "--test-every 0 keeps none for testing")
     layout = with_masks(folder, _checked(folder, layout))
-    return with_lenses(layout) if config.lenses == "native" else layout
+    check_lenses(folder, layout)
+    return with_lenses(layout) if trains_natively(layout, config.lenses) else layout
 
 
 def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     """What was loaded, in a line, and what is to be known of it, in further ones; layout: what it was loaded from."""
-    sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
+    views = [*scene.train, *scene.test]
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
     size = " to ".join(f"{width}x{height}" for width, height in sizes[::max(1, len(sizes) - 1)])
     first, file_size = scene.train[0].camera, size_of_image(layout.train[0])
     if (first.width, first.height) != file_size:
@@ -128,9 +130,12 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     if scene.start:
         points = f"{count:,} Gaussians of a model"
     lines = [layout.warning, scene.note]
-    models = sorted({view.camera.lens.camera_model for view in [*scene.train, *scene.test] if view.camera.lens})
+    models = sorted({view.camera.lens.camera_model for view in views if view.camera.lens})
     if models:
-        lines.append(f"images of camera model {', '.join(models)} stay as they are; Gaussians are projected through it")
+        why = ", since undistortion would cut off much of them" if config.lenses == "auto" else ""
+        masked = any(shown_by_lens(view.camera) is not None for view in views)
+        lines.append(f"images of camera model {', '.join(models)} stay as they are{why}; Gaussians are projected "
+                     f"through it{', pixels beyond the lens are masked' * masked}")
     if config.batch > len(scene.train):
         lines.append(f"note: a step of --batch {config.batch} shows some of the {len(scene.train)} training images "
                      "more than once")

@@ -8,7 +8,7 @@ import io
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, List, Sequence, Tuple
+from typing import Any, Sequence, Tuple
 
 import numpy as np
 from PIL import Image
@@ -34,7 +34,10 @@ from .lens import AROUND, THIN_PRISM, Lens
 CACHE_VARIABLE = "DSMOE_CACHE"  # a folder for undistorted images, in place of the scene's own
 CACHE_NAME = ".dsmoe_cache"  # of a scene's folder
 VERSION = 2  # of what is done here; another one is another file
-SAMPLES = 4096  # of the distortion along a radius
+
+
+MOST_CUT = 0.1  # of an image's pixels, beyond which undistortion loses more than a resampled image is worth
+GRID = 64  # places along a side of an image by which that is counted
 
 
 @dataclass(frozen=True)
@@ -63,10 +66,37 @@ class _Plan:
                                    mask=self.mask if is_file(self.mask) else None)
 
 
+def cut_off(camera: Camera, lens: Lens) -> float:
+    """The part of an image's pixels, 0 to 1, that undistortion cuts off: by the radial part of the distortion.
+
+    camera: without the lens.
+    """
+    if lens.model in (THIN_PRISM, AROUND):  # OpenCV does not undistort it
+        return 1.0
+    steps = (np.arange(GRID) + 0.5) / GRID
+    x, y = np.meshgrid((steps * camera.width - camera.cx) / camera.fx, (steps * camera.height - camera.cy) / camera.fy)
+    radii, distorted = lens.radii
+    radius = np.hypot(x, y)
+    shown = radius < distorted[-1]
+    straight = np.interp(radius, distorted, radii)
+    if lens.is_fisheye:
+        straight = np.tan(np.minimum(straight, 0.499 * np.pi))
+    stretch = straight / np.maximum(radius, 1e-9)
+    columns, rows = x * stretch * camera.fx + camera.cx, y * stretch * camera.fy + camera.cy
+    kept = (columns >= 0) & (columns <= camera.width) & (rows >= 0) & (rows <= camera.height)
+    return float((shown & ~kept).sum() / max(1, shown.sum()))
+
+
+def trains_natively(layout: Layout, lenses: str) -> bool:
+    """Whether a scene's images keep their lens, by --lenses."""
+    images = [*layout.train, *layout.test] if lenses == "auto" else []
+    return lenses == "native" or any(cut_off(image.camera, image.lens) > MOST_CUT for image in images if image.lens)
+
+
 def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str]:
     """The layout with pinhole images in place of bent ones, and a line about that; empty if none are bent.
 
-    The pinhole camera has the focal lengths, the principal point and the size of the bent one: what lies beyond its
+    The pinhole camera has the focal lengths, the principal point and the size of the bent one. What lies beyond its
     borders is cut off, and pixels that the lens does not show are masked. Raises SceneError, also without OpenCV.
     """
     images = [*layout.train, *layout.test]
@@ -80,7 +110,8 @@ def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str
                          "--lenses native trains through it")
     if not _opencv():
         raise SceneError(f"scene {scene}: {len(bent)} images have lens distortion (camera model {models}); OpenCV "
-                         f"removes it: {pip_install('opencv-python-headless')}, then type the same command")
+                         f"removes it: {pip_install('opencv-python-headless')}, then type the same command; or "
+                         "--lenses native trains through it")
     folder = cache_folder(scene)
     os.makedirs(folder, exist_ok=True)
     remove_unfinished(folder)
@@ -188,7 +219,7 @@ def _make_mask(plan: _Plan) -> None:
 
 
 def _unchanged(path: str, checksum: str) -> bytes:
-    """The content of a file, which must be that of the plan. Raises SceneError."""
+    """The content of a file, which must be as it was planned. Raises SceneError."""
     content = read_content(path)
     if _checksum(content) != checksum:
         raise SceneError(f"{path} has changed while the scene was loaded; type the same command again")
@@ -227,21 +258,5 @@ def _valid(intrinsics: Sequence[float], lens: Lens) -> np.ndarray:
     inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     columns, rows = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
     radius = np.hypot(columns, rows)
-    return inside & (radius < _last_radius(lens, float(radius.max())))
-
-
-def _last_radius(lens: Lens, largest: float) -> float:
-    """Up to which radius, on the plane at depth 1, the distorted one grows with it; infinite if up to `largest`."""
-    if lens.is_fisheye:
-        angle = np.linspace(0, np.arctan(largest), SAMPLES)
-        radius, square = np.tan(angle), angle**2
-        k1, k2, k3, k4 = lens.coefficients
-        distorted = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
-    else:
-        radius = np.linspace(0, largest, SAMPLES)
-        square = radius**2
-        k1, k2, _, _, k3, k4, k5, k6 = lens.coefficients
-        distorted = radius * (1 + square * (k1 + square * (k2 + square * k3))) / (
-            1 + square * (k4 + square * (k5 + square * k6)))
-    falls: List[int] = np.flatnonzero(np.diff(distorted) <= 0).tolist()
-    return float(radius[falls[0]]) if falls else np.inf
+    last = lens.radii[0][-1]
+    return inside & ((np.arctan(radius) if lens.is_fisheye else radius) < last)

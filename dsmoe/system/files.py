@@ -6,12 +6,16 @@ import glob
 import json
 import math
 import os
+import socket
 import stat
+import time
+import zlib
 from typing import Any, BinaryIO, Callable, Iterator, Optional
 
 from ..errors import TrainerError
 
-PART = ".dsmoe_part-"  # begins the name of a file that is not whole yet; the number of its process follows
+PART = ".dsmoe_part-"  # begins the name of a file that is not whole yet; host and process follow
+ABANDONED = 24 * 3600  # seconds; containers with one host's name do not see each other's processes
 
 
 def is_file(path: str) -> bool:
@@ -74,14 +78,14 @@ def check_output(path: str, overwrite: bool = True) -> None:
 def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
     """Gives the name of a file to write beside `path`, with its ending; without an error it becomes `path`.
 
-    No two processes get the same name. What a killed process left is removed. Raises OSError, which names `path`, and
-    TrainerError as `check_output`, also if the file has come meanwhile.
+    No two processes of a host get the same name. What one left that was killed long ago is removed. Raises OSError,
+    which names `path`, and TrainerError as `check_output`, also if the file has come meanwhile.
     """
     check_output(path, overwrite)
     folder, name = os.path.split(os.path.abspath(path))
     os.makedirs(folder, exist_ok=True)
     remove_unfinished(folder, name)
-    temporary = os.path.join(folder, f"{PART}{os.getpid()}-{name}")
+    temporary = os.path.join(folder, f"{own_part()}{os.getpid()}-{name}")
     _remove(temporary)  # of a process that had this number
     try:
         yield temporary
@@ -95,12 +99,19 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
         _remove(temporary)
 
 
+def own_part() -> str:
+    """PART, and a checksum of this host's name: on a network folder another host's process may have the same number."""
+    return f"{PART}{zlib.crc32(os.fsencode(socket.gethostname())):08x}-"
+
+
 def remove_unfinished(folder: str, name: Optional[str] = None) -> None:
-    """Removes what killed processes have left in a folder, of all files or of those with one name."""
-    for left in glob.glob(os.path.join(glob.escape(folder), f"{PART}*-{glob.escape(name) if name else '*'}")):
-        number = os.path.basename(left)[len(PART):].partition("-")[0]
-        if number.isdigit() and not _runs(int(number)):
-            _remove(left)
+    """Removes what processes of this host, killed long ago, left in a folder: all files, or those with one name."""
+    own = own_part()
+    for left in glob.glob(os.path.join(glob.escape(folder), f"{own}*-{glob.escape(name) if name else '*'}")):
+        number = os.path.basename(left)[len(own):].partition("-")[0]
+        with contextlib.suppress(OSError):  # it may be gone by now
+            if number.isdigit() and not _runs(int(number)) and time.time() - os.stat(left).st_mtime > ABANDONED:
+                _remove(left)
 
 
 def _remove(path: str) -> None:

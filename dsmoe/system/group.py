@@ -210,7 +210,7 @@ def join_group(device: str) -> Group:
 
 
 def _wait_for_name(name: str, do_not_meet: str) -> None:
-    """Until the name of a host is known, as that of one that starts; torch would try for TIMEOUT.
+    """Waits until the name of a host is known, as of a host that starts; torch would try for TIMEOUT.
 
     Raises TrainerError if it is not within PATIENCE. do_not_meet: the beginning of that error.
     """

@@ -143,7 +143,7 @@ def own_record(folder: str, command: str, overwrite: bool = False, folders: Coll
 def refuse_others(folder: str, command: str, remedy: str = "") -> None:
     """Raises TrainerError if something is in a folder without a record: the command has not written it.
 
-    A lock, or what a killed process has left of a file, is no such thing. remedy: another one, for that error.
+    A lock, and what a killed process has left of a file, may be there. remedy: another one, for that error.
     """
     there = sorted(name for name in os.listdir(folder) if name != LOCK_NAME and not name.startswith(PART)
                    ) if os.path.isdir(folder) else []

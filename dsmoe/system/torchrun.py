@@ -13,7 +13,7 @@ from .children import die_with_parent
 GPUS, AUTO = "--gpus", "auto"
 
 PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # the folder that has dsmoe
-# What each process runs: this package, where `-m dsmoe` would take a dsmoe of the current folder, such as its source.
+# What each process runs: this package. `-m dsmoe` would take a dsmoe of the current folder, such as its source.
 PROCESS = "import sys; sys.path.insert(0, sys.argv.pop(1)); from dsmoe.cli import main; sys.exit(main())"
 
 

@@ -86,7 +86,7 @@ def damage_named(path: str) -> Iterator[None]:
     """Makes a TrainerError of whatever a damaged checkpoint causes while it is read and taken over.
 
     Its text is not torch's, which advises to read such a file with weights_only=False, and so to run code from it.
-    What says nothing of the file stays as it is: no memory, a GPU that fails, a module that this machine lacks.
+    Errors that say nothing of the file stay as they are: no memory, a GPU that fails, a module that this machine lacks.
     """
     try:
         yield

@@ -20,7 +20,9 @@ class Forecast:
     def __init__(self, config: TrainConfig, scene: Scene) -> None:
         self.config = config
         camera = scene.train[0].camera
-        self.removes = scene.start is not None and 0 < config.budget < len(scene.points.positions)
+        count = len(scene.points.positions)
+        self.removes = scene.start is not None and 0 < config.budget < count
+        self.keeps = scene.start is not None and config.strategy == "importance" and config.budget == count
         smaller = smaller_images(camera.width, camera.height)
         is_short = self.removes or config.iterations <= FAST["cpu"].iterations and not smaller
         self.shorter = "" if is_short else f"{FLAG} {flags_text(smaller)}".rstrip()
@@ -45,8 +47,9 @@ class Forecast:
 
     def text(self, left: int, seconds: float) -> str:
         """left: iterations."""
-        line = f"at this speed the other {left:,} iterations take about {duration(seconds)}, "
-        line += "less and less as Gaussians are removed" if self.removes else "longer as Gaussians are added"
+        line = f"at this speed the other {left:,} iterations take about {duration(seconds)}"
+        if not self.keeps:
+            line += ", less and less as Gaussians are removed" if self.removes else ", longer as Gaussians are added"
         if seconds < LONG_SECONDS or not self.shorter:
             return line
         return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: --overwrite {self.shorter}"

@@ -19,7 +19,7 @@ class LearnedGate:
     """
 
     def __init__(self, options: GateOptions, batch: int, device: str) -> None:
-        """batch: views a step, by which rate and betas go as those of the Gaussians."""
+        """batch: views a step; rate and betas follow it, as those of the Gaussians do."""
         self.bound = options.bound
         self.logarithm = torch.full((1,), math.log(options.start - self.bound), device=device)
         self._rate, self._betas = options.rate * math.sqrt(batch), batch_betas(batch)

@@ -13,16 +13,12 @@ import math
 import sys
 import warnings
 import weakref
-from typing import Any, Callable, Dict, Hashable, Iterator, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, Hashable, Iterator, List, Optional, Sequence
 
 import torch
 
-from diff_smoe_rasterization.settings import GaussianRasterizationSettings
-
 from ..errors import out_of_memory
-from ..scenes.images import View
-
-_OPS = torch.ops.diff_smoe_rasterization
+from .step_parts import Compare, Drawn, Frame, Numbers, StepParts, ViewOver
 
 WARM_UP = 64  # steps without a graph, from which the room for the lists of tile instances is learned
 MOST_KINDS = 4  # that are captured at a time: each takes memory
@@ -36,65 +32,76 @@ MATRICES = ("viewmatrix", "projmatrix", "campos")
 PLANES = ("image", "opacity", "mask")
 
 
-class Captured:
-    """The three parts of a step of one kind, captured; their results lie in the same tensors at each replay."""
+class Captured(StepParts):
+    """The parts of steps of one kind, captured; their results lie in the same tensors at each replay."""
 
-    def __init__(self, record: Callable[[Callable[[], Any]], Callable[[], Any]]) -> None:
-        """record: runs a function to capture it, and returns what repeats it."""
-        self._record = record
-        self.drawn: Any = None
+    def __init__(self, launched: StepParts, frame: Frame, compare: Compare,
+                 record: Callable[[Callable[[], None]], Callable[[], None]]) -> None:
+        """Nothing is computed. record: runs a function to capture it, and returns what repeats it."""
+        self.numbers = launched.numbers
+        self._copies = [tensor.clone() for tensor in _varying(frame)]
+        own = _with_varying(frame, self._copies)
         self.used = 0  # the step of the training in which it was replayed last
 
-    def copies(self, settings: GaussianRasterizationSettings, view: View, background: Optional[torch.Tensor]
-               ) -> Tuple[GaussianRasterizationSettings, View, Optional[torch.Tensor]]:
-        """The same settings and view with tensors of their own, into which `replay_draw` copies each view."""
-        matrices = {name: getattr(settings, name).clone() for name in MATRICES}
-        planes = {name: getattr(view, name) for name in PLANES}
-        planes = {name: plane.clone() for name, plane in planes.items() if plane is not None}
-        self._copies = [*matrices.values(), *planes.values()]
-        if background is not None:
-            background = background.clone()
-            self._copies.append(background)
-            settings = settings._replace(bg=background)
-        return settings._replace(**matrices), dataclasses.replace(view, **planes), background
+        def draw() -> None:
+            self.drawn = launched.draw(own, compare)
 
-    def capture(self, draw: Callable[[], Any], differentiate: Callable[[Any], None], update: Callable[[], None]
-                ) -> None:
-        """Captures the parts: up to the loss, from there to the gradients, and to the next parameters.
+        self._draw = record(draw)
+        self._differentiate = record(lambda: launched.differentiate(self.drawn))
+        self._update = record(lambda: launched.update(self.drawn.rendering.radii))
 
-        draw: its results are `drawn`, and the argument of `differentiate`.
-        """
+    def send(self, frame: Frame, numbers: Numbers) -> None:
+        self.numbers.send(numbers, self._copies, _varying(frame))
 
-        def keep() -> None:
-            self.drawn = draw()
-
-        self._draw = self._record(keep)
-        self.replay_differentiate = self._record(lambda: differentiate(self.drawn))
-        self.replay_update = self._record(update)
-
-    def replay_draw(self, numbers: torch.Tensor, new_numbers: Sequence[float], settings: GaussianRasterizationSettings,
-                    view: View, background: Optional[torch.Tensor]) -> Any:
-        """Copies a view and numbers, and draws; returns the results, which hold until the next replay."""
-        given = [*(getattr(settings, name) for name in MATRICES), *(getattr(view, name) for name in PLANES), background]
-        _OPS.set_inputs(self._copies, [tensor for tensor in given if tensor is not None], numbers, new_numbers)
+    def draw(self, frame: Frame, compare: Compare) -> Drawn:
         self._draw()
         return self.drawn
+
+    def differentiate(self, drawn: Drawn) -> None:
+        self._differentiate()
+
+    def update(self, radii: torch.Tensor) -> None:
+        self._update()
+
+
+def _varying(frame: Frame) -> List[torch.Tensor]:
+    """The tensors in which frames of one kind differ."""
+    (view, background), settings = frame
+    tensors = [*(getattr(settings, name) for name in MATRICES), *(getattr(view, name) for name in PLANES), background]
+    return [tensor for tensor in tensors if tensor is not None]
+
+
+def _with_varying(frame: Frame, tensors: Sequence[torch.Tensor]) -> Frame:
+    """The frame with others in place of what `_varying` gives."""
+    (view, background), settings = frame
+    others = iter(tensors)
+    settings = settings._replace(**{name: next(others) for name in MATRICES})
+    view = dataclasses.replace(view, **{name: next(others) for name in PLANES if getattr(view, name) is not None})
+    if background is not None:
+        background = next(others)
+        settings = settings._replace(bg=background)
+    return Frame(ViewOver(view, background), settings)
+
+
+def _kind_of(frame: Frame, loss_rule: Hashable) -> Hashable:
+    """What two steps must have in common so that one graph does for both."""
+    (view, background), settings = frame
+    gate: Any = settings.background_gate
+    common = settings._replace(viewmatrix=None, projmatrix=None, campos=None, bg=None,
+                               background_gate=id(gate) if isinstance(gate, torch.Tensor) else gate)
+    return common, loss_rule, background is None, view.opacity is None, view.mask is None
 
 
 class NoGraphs:
     """Captures nothing."""
 
-    def kind(self, settings: GaussianRasterizationSettings, loss_rule: Hashable, view: View,
-             background: Optional[torch.Tensor]) -> Hashable:
-        """What two steps must have in common so that one graph does for both."""
-        return None
+    def parts(self, launched: StepParts, frame: Frame, compare: Compare, loss_rule: Hashable, memory: Sequence[Any]
+              ) -> StepParts:
+        """A step like this one, captured now if need be, or the one that launches.
 
-    def find(self, memory: Sequence[Any], kind: Hashable, capture: Callable[[Captured], None]) -> Optional[Captured]:
-        """The step of this kind, captured now if need be; None if it has to be launched.
-
-        memory: all whose tensors a step reads or writes where they lie. capture: captures a step.
+        memory: all whose tensors a step reads or writes where they lie.
         """
-        return None
+        return launched
 
 
 class Graphs(NoGraphs):
@@ -111,14 +118,13 @@ class Graphs(NoGraphs):
         self._steps = self._launched = 0
         self._too_many: float = math.inf  # Gaussians, with whose graphs the memory did not suffice
 
-    def kind(self, settings: GaussianRasterizationSettings, loss_rule: Hashable, view: View,
-             background: Optional[torch.Tensor]) -> Hashable:
-        gate: Any = settings.background_gate
-        common = settings._replace(viewmatrix=None, projmatrix=None, campos=None, bg=None,
-                                   background_gate=id(gate) if isinstance(gate, torch.Tensor) else gate)
-        return common, loss_rule, background is None, view.opacity is None, view.mask is None
+    def parts(self, launched: StepParts, frame: Frame, compare: Compare, loss_rule: Hashable, memory: Sequence[Any]
+              ) -> StepParts:
+        return self._find(memory, _kind_of(frame, loss_rule),
+                          lambda: Captured(launched, frame, compare, self._record)) or launched
 
-    def find(self, memory: Sequence[Any], kind: Hashable, capture: Callable[[Captured], None]) -> Optional[Captured]:
+    def _find(self, memory: Sequence[Any], kind: Hashable, capture: Callable[[], Captured]) -> Optional[Captured]:
+        """The step of this kind, captured now if need be; None if it has to be launched."""
         self._steps += 1
         if len(memory) != len(self._memory) or any(here is not ref() for here, ref in zip(memory, self._memory)):
             self._memory = [weakref.ref(here) for here in memory]
@@ -149,7 +155,7 @@ class Graphs(NoGraphs):
         self._captured = {other: graph for other, graph in self._captured.items() if self._steps - graph.used <= IDLE}
         return len(self._captured) < MOST_KINDS
 
-    def _capture(self, num_gaussians: int, capture: Callable[[Captured], None]) -> Optional[Captured]:
+    def _capture(self, num_gaussians: int, capture: Callable[[], Captured]) -> Optional[Captured]:
         """A new step; None if the memory does not suffice, also when all other graphs are gone."""
         if num_gaussians >= self._too_many:
             return None
@@ -173,12 +179,10 @@ class Graphs(NoGraphs):
         """Whether a late replay had nearly more tile instances than there is room for."""
         return False
 
-    def _new(self, num_gaussians: int, capture: Callable[[Captured], None]) -> Captured:
-        captured = Captured(self._record)
-        capture(captured)
-        return captured
+    def _new(self, num_gaussians: int, capture: Callable[[], Captured]) -> Captured:
+        return capture()
 
-    def _record(self, function: Callable[[], Any]) -> Callable[[], Any]:
+    def _record(self, function: Callable[[], None]) -> Callable[[], None]:
         """Here the function runs anew at each replay: for tests without a GPU."""
         return function
 
@@ -208,7 +212,7 @@ class CudaGraphs(Graphs):
         self._bytes = 0.0  # that the graphs take for each Gaussian
         self._reserve = 0  # bytes that the pool began with
 
-    def _new(self, num_gaussians: int, capture: Callable[[Captured], None]) -> Captured:
+    def _new(self, num_gaussians: int, capture: Callable[[], Captured]) -> Captured:
         fresh = num_gaussians > self._room
         if fresh:
             self._begin_pool(num_gaussians)
@@ -247,10 +251,10 @@ class CudaGraphs(Graphs):
 
         self._keeper = self._record_graph(keep)
 
-    def _record(self, function: Callable[[], Any]) -> Callable[[], Any]:
+    def _record(self, function: Callable[[], None]) -> Callable[[], None]:
         return self._record_graph(function).replay
 
-    def _record_graph(self, function: Callable[[], Any]) -> Any:
+    def _record_graph(self, function: Callable[[], None]) -> Any:
         # Not torch.cuda.graph, which waits for the device and frees all cached memory first.
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(self._stream), _no_collection():

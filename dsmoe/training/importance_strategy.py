@@ -1,7 +1,7 @@
 """The strategy `importance`: to a given number of Gaussians, those that explain most.
 
-It grows well beyond the budget, removes in steps the Gaussians whose removal changes the training views least, and then
-moves the cheapest of what is left to where the error is. Cost and error are sums over pixels of squared colours, so
+It grows well beyond the budget. Then it removes in steps the Gaussians whose removal changes the training views least,
+and moves the cheapest of what is left to where the error is. Cost and error are sums over pixels of squared colours, so
 they can be compared: `Splats.importance`. The rules and what they are worth: docs/trainer.md.
 """
 from __future__ import annotations

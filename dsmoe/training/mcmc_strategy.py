@@ -16,7 +16,7 @@ from .randomness import draw
 from .strategy import Step, Strategy, StrategyContext
 
 DEAD_OPACITY = 0.005  # fainter Gaussians are relocated
-START_OPACITY, START_SCALE = 0.5, 0.1  # of the first Gaussians; the scale is a part of that of 3DGS
+START_OPACITY, START_SCALE = 0.5, 0.1  # of the first Gaussians; the scale is this part of 3DGS's
 OPACITY_WEIGHT = SCALE_WEIGHT = 0.01  # lambda_o and lambda_Sigma of the loss
 NOISE_RATE = 5e5  # lambda_noise
 NOISE_STEEPNESS = 100.0  # k: Gaussians are moved by the noise if they are faint

@@ -22,7 +22,7 @@ def seed_everything(seed: int) -> None:
 def random_state(device: str) -> Dict[str, Any]:
     """The states of all generators of a training on the device, as tensors and plain values.
 
-    Of the process's own GPU alone: a run may go on where there are fewer.
+    Of GPUs only the process's own: a run may go on where there are fewer.
     """
     name, keys, position, has_gauss, gauss = np.random.get_state()
     return {
@@ -72,9 +72,9 @@ class ViewOrder:
 
 
 def draw(weights: torch.Tensor, count: int, replacement: bool = False) -> torch.Tensor:
-    """Returns rows [count], drawn by weights [N] of at least 0; without replacement count of them must be above 0.
+    """Returns rows [count], drawn by weights [N], 0 or more; without replacement `count` of them must be above 0.
 
-    Raises TrainerError for weights of which a training that goes on has none, such as NaN.
+    Raises TrainerError for weights that no training in order has, such as NaN.
     """
     total = float(weights.sum())
     if not 0 < total < float("inf"):

@@ -6,12 +6,12 @@ import torch
 from ..options.config import TrainConfig
 from .graphs import PIXEL_BYTES
 
-# Numbers of memory that a Gaussian takes at the peak: for each of its parameters that one, its gradient, two moments of
-# Adam, and what a densification copies. Others are activations, places on the image, statistics and tile lists. By
-# benchmarks/results/tails_h100.jsonl and near_*.jsonl, from 1.2 to 3.0 million Gaussians of degree 3 each adds 1,431 B
-# (bonsai, alpha) and 1,516 B (smoe).
+# How many numbers of memory a Gaussian takes at the peak. A parameter takes five: itself, its gradient, Adam's two
+# moments, and what a densification copies. The others are activations, places on the image, statistics and tile lists.
+# From 1.2 to 3.0 million Gaussians of degree 3 each adds 1,431 B (bonsai, alpha) and 1,516 B (smoe), by
+# benchmarks/results/tails_h100.jsonl and near_*.jsonl.
 FOR_EACH_PARAMETER, OTHERS = 5, 65
-# For each further view of a batch its rows, gradients by these and by places: 64 B if half of the Gaussians are seen.
+# Each further view of a batch adds rows, and gradients by these and by places: 64 B if half of the Gaussians are seen.
 OF_A_FURTHER_VIEW = 16
 PARAMETERS_BESIDE_COLOR = 11  # mean, opacity, scales, rotation
 

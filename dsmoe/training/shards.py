@@ -17,7 +17,7 @@ class Route(NamedTuple):
 class Shards:
     """All Gaussians are in this process. distributed/shards.py has what holds if there are several.
 
-    The Gaussians have one order, that of one process; each has a run of it.
+    The Gaussians have the order of a training in one process; each process has a run of it.
     """
 
     def total(self, count: int) -> int:

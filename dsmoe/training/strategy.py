@@ -76,14 +76,28 @@ def is_due(iteration: int, interval: int, batch: int = 1) -> bool:
 
 @dataclass
 class Step:
-    """One training step, as far as it has come when a hook is called. Iterations count views, from 1."""
+    """One training step, as far as it has come when a hook is called. Iterations count views, from 1.
+
+    The trainer calls `backward` and, but in the last step, `update`.
+    """
 
     iteration: int  # of its last view
     batch: int  # views, each an iteration
     loss: torch.Tensor  # the mean over the views
-    add_gradient: Callable[[str, float], None]  # to that by every opacity, scale or rotation; after backward
     looks: List[Look] = field(default_factory=list, init=False)  # at the views that the strategy's `looks_at` has named
     seen: List[Seen] = field(default_factory=list, init=False)  # what each view says of the Gaussians; after backward
+
+    def backward(self) -> None:
+        """From the gradients by the images to those by all parameters and the gate; sets `seen`."""
+        raise NotImplementedError
+
+    def add_gradient(self, name: str, number: float) -> None:
+        """Adds a number to the loss's gradient by every opacity, scale or rotation, as `name` says; after backward."""
+        raise NotImplementedError
+
+    def update(self) -> None:
+        """Steps the parameters that have not been replaced since the step was rendered."""
+        raise NotImplementedError
 
     def due(self, interval: int) -> bool:
         """Whether a multiple of the interval is among the step's iterations."""

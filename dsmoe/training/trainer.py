@@ -21,11 +21,12 @@ from ..system.group import ALONE
 from ..system.stopwatch import Stopwatch
 from .gate import LearnedGate
 from .graphs import CudaGraphs
-from .passes import AutogradPasses, DirectPasses, Passes, ViewOver
+from .passes import AutogradPasses, DirectPasses, Passes
 from .randomness import ViewOrder, random_state, restore_random_state, seed_everything
 from .room import free_bytes, gaussian_bytes
 from .shards import Shards
 from .state_check import check_state
+from .step_parts import ViewOver
 from .strategies import STRATEGIES
 from .strategy import Step, StrategyContext, ViewStep, is_due
 
@@ -148,13 +149,13 @@ class Trainer:
         if isinstance(step, ViewStep):  # a repeated step does not call `_compare`
             self._report = (step.rendering.color.detach(), step.target, step.view)
         self.strategy.before_backward(step)
-        self.passes.backward(step)
+        step.backward()
         if before_change:
             before_change()
         if self.iteration < config.iterations:
             with torch.no_grad():
                 self.strategy.after_backward(step)
-                self.passes.update()
+                step.update()
                 if self.gate:
                     self.gate.step()
                 self.strategy.after_step(step)
@@ -207,7 +208,7 @@ class Trainer:
         return self._evaluate(self.scene.test, progress, image_metrics, PASSES)
 
     def evaluate_training_views(self, progress: bool = False) -> Optional[float]:
-        """Their mean PSNR. Where it rises and that of the test views does not, a longer training only overfits."""
+        """Their mean PSNR. If it rises and the test views' does not, a longer training only overfits."""
         return self._evaluate(self.scene.train, progress, psnr_alone, 1).metrics["psnr"]
 
     def _evaluate(self, views: Sequence[View], progress: bool, measure: Measure, passes: int) -> Evaluation:

@@ -24,7 +24,7 @@ def refusal(origin: Optional[str], host: Optional[str], served_at: str) -> Optio
 
     origin: the header by which a browser says whose page asks; other programs send none. host: the header that says
     what the browser takes this server for. A page of another site may name itself as the host once its name leads here
-    (DNS rebinding), so the host has to be an address or a name of this machine. served_at: the viewer's --host.
+    (DNS rebinding). So the host must be an address or a name of this machine. served_at: the viewer's --host.
     """
     name = _host_name(host or "")
     if not (_is_address(name) or name == "localhost" or name.endswith(".localhost")

@@ -38,6 +38,7 @@ int render(const char* model_path, const char* image_path) {
   // A file of another program records nothing: alpha. value() throws for a mode that there is not.
   frame.config.blend.mode = dsmoe::blend_mode_of(model.blend_mode.empty() ? "alpha" : model.blend_mode).value();
   frame.config.blend.background_gate = float(model.background_gate.value_or(0));
+  if (model.faint_below) frame.config.blend.faint_below = float(*model.faint_below);
   frame.config.background = background;
   frame.config.num_threads = 4;
   frame.images.color = image.data(), frame.images.gate_sum = gate_sum.data(), frame.images.radii = radii.data();

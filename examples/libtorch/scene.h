@@ -36,7 +36,8 @@ inline torch::Tensor rotated(const torch::Tensor& vectors, const torch::Tensor& 
 inline View load_view(const dsmoe::io::ColmapImage& posed, const dsmoe::io::ColmapCamera& camera,
                       const std::string& folder, int divisor, torch::Device device) {
   const std::string path = folder + "/" + posed.name, model = camera.model->name;
-  if (model != "PINHOLE" && model != "SIMPLE_PINHOLE") throw std::runtime_error(path + ": undistort first: " + model);
+  if (model != "PINHOLE" && model != "SIMPLE_PINHOLE")
+    throw std::runtime_error(path + ": its lens is " + model + "; `colmap image_undistorter` makes pinhole images");
   cv::Mat pixels = cv::imread(path, cv::IMREAD_COLOR | cv::IMREAD_IGNORE_ORIENTATION);
   if (pixels.empty()) throw std::runtime_error(path + ": not a readable image");
   if (divisor > 1) cv::resize(pixels, pixels, {}, 1.0 / divisor, 1.0 / divisor, cv::INTER_AREA);

@@ -117,6 +117,9 @@ int main(int argc, char** argv) {
       options[argv[i]] = argv[i + 1];
     }
     train(argv[1], argv[2], options);
+  } catch (const c10::Error& error) {
+    std::fprintf(stderr, "%s\n", error.what_without_backtrace());
+    return 1;
   } catch (const std::exception& error) {
     std::fprintf(stderr, "%s\n", error.what());
     return 1;

@@ -36,6 +36,7 @@ std::vector<double> flat(const CameraGradient<double>& g) {
   std::vector<double> out(g.view, g.view + 16);
   out.insert(out.end(), g.projection, g.projection + 16);
   out.insert(out.end(), g.position, g.position + 3);
+  out.insert(out.end(), g.view_end, g.view_end + 16);
   return out;
 }
 
@@ -58,13 +59,14 @@ TEST(TransformPoint, BackwardIsTheDerivative) {
 
 TEST(CameraGradient, AddsSharesAndOthersOfItsKind) {
   Random random(2);
-  const auto x = random.uniforms(21);
-  const CameraShare<double> share = {
-      vec3(&x[0]), vec3(&x[3]), {vec3(&x[6]), vec3(&x[9]), vec3(&x[12])}, vec3(&x[15]), vec3(&x[18])};
+  const auto x = random.uniforms(33);
+  const auto mat3 = [&](int i) { return Mat3<double>{vec3(&x[i]), vec3(&x[i + 3]), vec3(&x[i + 6])}; };
+  const CameraShare<double> share = {vec3(&x[0]),  vec3(&x[3]),  mat3(6), vec3(&x[15]),
+                                     vec3(&x[18]), vec3(&x[21]), mat3(24)};
   CameraGradient<double> once, shares, whole;
   once.add(share);
   for (int i = 0; i < 2; ++i) shares.add(share), whole.add(once);
-  for (int i = 0; i < 35; ++i) {
+  for (int i = 0; i < 51; ++i) {
     EXPECT_EQ(flat(whole)[i], 2 * flat(once)[i]);
     EXPECT_NEAR(flat(shares)[i], 2 * flat(once)[i], 1e-15);  // sums of four numbers below 1
   }

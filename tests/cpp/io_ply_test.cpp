@@ -194,6 +194,27 @@ TEST(PlyGaussians, BackgroundGateReadsBackExactly) {
   expect_contains(read_bytes(folder.file("d.ply")), "\ncomment background_gate 0.05\n");
 }
 
+TEST(PlyGaussians, FaintBelowIsReadFromItsComment) {
+  const TemporaryFolder folder;
+  std::string bytes = one_gaussian(0);
+  EXPECT_EQ(parse_gaussians(bytes, "a.ply").faint_below, std::nullopt);
+  const std::size_t place = bytes.find("element");
+  std::string wrong = bytes;
+  wrong.insert(place, "comment faint_below most\n");
+  expect_contains(format_error_of([&] { parse_gaussians(wrong, "a.ply"); }),
+                  "a.ply, line 3: the comment's faint_below value is \"most\"; it must be a number, 0 or more");
+  bytes.insert(place, "comment blend_mode smoe\ncomment faint_below 0.125\n");
+  const GaussianModel read = parse_gaussians(bytes, "a.ply");
+  EXPECT_EQ(read.faint_below, std::optional<double>(0.125));
+  write_gaussians(folder.file("a.ply"), read);
+  const std::string written = read_bytes(folder.file("a.ply"));
+  EXPECT_EQ(written.find("faint_below"), written.rfind("faint_below")) << "it is not recorded once more";
+  GaussianModel model = make_model(1, 0);
+  model.faint_below = 2;
+  write_gaussians(folder.file("b.ply"), model);
+  EXPECT_EQ(read_gaussians(folder.file("b.ply")).faint_below, std::optional<double>(2));
+}
+
 TEST(PlyGaussians, WhatIsNoBackgroundGateIsRefused) {
   const TemporaryFolder folder;
   const auto message_of = [](const std::string& comments) {

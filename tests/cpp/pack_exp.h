@@ -4,7 +4,7 @@
 namespace dsmoe {
 
 struct PackExp {
-  const char* name;
+  int bits;  // of a register
   // Reads and writes a multiple of 64 bytes; no alignment is asked for.
   void (*in_float)(const float* x, float* result, int count);
   void (*in_double)(const double* x, double* result, int count);

@@ -1,8 +1,6 @@
 // The packs' exponential for any machine.
 #define DSMOE_SIMD baseline
 #define DSMOE_SIMD_BYTES 16
-#include "pack_exp_impl.h"
-
-namespace dsmoe {
-const PackExp kBaselinePackExp = baseline::pack_exp("baseline");
-}  // namespace dsmoe
+#define DSMOE_PACK_EXP kBaselinePackExp
+#define DSMOE_SIMD_CODE "pack_exp_impl.h"
+#include "cpu/simd_target.h"

@@ -1,4 +1,4 @@
-// Included once per instruction set, by a file that has set DSMOE_SIMD and DSMOE_SIMD_BYTES as for cpu/pack.h.
+// Included once per instruction set (cpu/simd_target.h), with DSMOE_PACK_EXP: the name of the result.
 #pragma once
 
 #include "cpu/pack.h"
@@ -18,7 +18,10 @@ template <class T> void exp_each(const T* x, T* result, int count) {
 }
 
 // A constant expression: no code of this instruction set runs before it is known to be there.
-constexpr PackExp pack_exp(const char* name) { return {name, exp_each<float>, exp_each<double>}; }
+constexpr PackExp pack_exp() { return {8 * DSMOE_SIMD_BYTES, exp_each<float>, exp_each<double>}; }
 
 }  // namespace DSMOE_SIMD
+
+const PackExp DSMOE_PACK_EXP = DSMOE_SIMD::pack_exp();
+
 }  // namespace dsmoe

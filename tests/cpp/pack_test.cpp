@@ -65,18 +65,18 @@ constexpr double kWorstUlps = 2;
 
 TEST(PackExp, IsAccurateToTwoUlpsAtEveryLevel) {
   for (const PackExp* level : available_levels()) {
-    EXPECT_LT(worst_ulps<float>(*level, -80), kWorstUlps) << level->name;
-    EXPECT_LT(worst_ulps<double>(*level, -700), kWorstUlps) << level->name;
-    EXPECT_LT(worst_ulps<float>(*level, 40), kWorstUlps) << level->name;
-    EXPECT_LT(worst_ulps<double>(*level, 40), kWorstUlps) << level->name;
+    EXPECT_LT(worst_ulps<float>(*level, -80), kWorstUlps) << level->bits;
+    EXPECT_LT(worst_ulps<double>(*level, -700), kWorstUlps) << level->bits;
+    EXPECT_LT(worst_ulps<float>(*level, 40), kWorstUlps) << level->bits;
+    EXPECT_LT(worst_ulps<double>(*level, 40), kWorstUlps) << level->bits;
   }
 }
 
 template <class S> void expect_exact_at_zero_and_never_above_one(const PackExp& level) {
   const std::vector<S> x = sample<S>(-80), y = exp_of(level, x);
-  EXPECT_EQ(y[0], 1) << level.name;
+  EXPECT_EQ(y[0], 1) << level.bits;
   // An opacity of exactly 1/255 must count at its centre, so o G may not round below o there, nor G above 1.
-  for (const S value : y) ASSERT_LE(value, 1) << level.name;
+  for (const S value : y) ASSERT_LE(value, 1) << level.bits;
 }
 
 TEST(PackExp, IsOneAtZeroAndNeverAbove) {
@@ -92,14 +92,14 @@ TEST(PackExp, StaysBelowEveryCutOffFarBelowZero) {
     std::vector<float> x(64, -1e30f);
     x[0] = -81, x[1] = -std::numeric_limits<float>::max(), x[2] = -infinity;
     for (const float value : exp_of(*level, x)) {
-      EXPECT_GE(value, 0) << level->name;
-      EXPECT_LT(value, 1e-30f) << level->name;
+      EXPECT_GE(value, 0) << level->bits;
+      EXPECT_LT(value, 1e-30f) << level->bits;
     }
     std::vector<double> wide(64, -1e300);
     wide[0] = -std::numeric_limits<double>::infinity();
     for (const double value : exp_of(*level, wide)) {
-      EXPECT_GE(value, 0) << level->name;
-      EXPECT_LT(value, 1e-300) << level->name;
+      EXPECT_GE(value, 0) << level->bits;
+      EXPECT_LT(value, 1e-300) << level->bits;
     }
   }
 }

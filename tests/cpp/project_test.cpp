@@ -99,6 +99,113 @@ TEST(ProjectGaussian, BackwardIsTheDerivativeThroughEveryLens) {
   }
 }
 
+TEST(ProjectGaussian, BackwardIsTheDerivativeWithARollingShutter) {
+  for (const Lens<double>& lens : make_lenses(40, 30)) {
+    for (const Shutter shutter : kRolling) {
+      Scene<double> scene = single_gaussian();
+      scene.camera.lens = lens;
+      scene.config.antialiasing = true;
+      set_shutter(scene.camera, shutter);
+      if (shutter == Shutter::kBottomToTop) {
+        scene.scales.clear(), scene.rotations.clear();
+        scene.cov3D_precomp = {0.25, 0.05, -0.03, 0.1, 0.02, 0.2};
+      }
+      expect_backward_is_the_derivative(scene);
+    }
+  }
+}
+
+// With slopes clamped the Jacobian is not the derivative of the pixel, and beyond the image the pose stands still.
+TEST(ProjectGaussian, BackwardIsTheDerivativeBesideARollingImage) {
+  for (const double aside : {2.8, -5.5}) {
+    for (const Shutter shutter : {Shutter::kTopToBottom, Shutter::kLeftToRight}) {
+      Scene<double> scene = single_gaussian();
+      scene.camera.lens = make_lenses(40, 30)[1];
+      set_shutter(scene.camera, shutter);
+      scene.means3D[0] = aside, scene.scales = {1.5, 0.9, 0.8};
+      const auto point = through_lens(scene.camera.lens, transform_point(scene.camera.view, load3(&scene.means3D[0])));
+      ASSERT_TRUE(point.pixel.x < -0.2 * 40 || point.pixel.x > 1.2 * 40) << point.pixel.x;
+      expect_backward_is_the_derivative(scene);
+    }
+  }
+}
+
+TEST(ProjectGaussian, ARollingShutterReadsEachRowByThePoseOfItsTime) {
+  Scene<double> scene = single_gaussian();
+  for (const Lens<double>& lens : make_lenses(40, 30)) {
+    for (const Shutter shutter : kRolling) {
+      scene.camera.lens = lens;
+      set_shutter(scene.camera, shutter);
+      const auto rolled = project(scene).gaussian;
+      const double place = shutter == Shutter::kTopToBottom   ? rolled.mean.y / 29
+                           : shutter == Shutter::kBottomToTop ? 1 - rolled.mean.y / 29
+                           : shutter == Shutter::kLeftToRight ? rolled.mean.x / 39
+                                                              : 1 - rolled.mean.x / 39;
+      ASSERT_GT(place, 0.1);
+      ASSERT_LT(place, 0.9);
+      Scene<double> still = scene;
+      still.camera.shutter = Shutter::kGlobal;
+      for (int k = 0; k < 16; ++k) still.camera.view[k] += place * (scene.camera.view_end[k] - scene.camera.view[k]);
+      const auto expected = project(still).gaussian;
+      EXPECT_NEAR(rolled.mean.x, expected.mean.x, 1e-11);
+      EXPECT_NEAR(rolled.mean.y, expected.mean.y, 1e-11);
+      EXPECT_NEAR(rolled.depth, expected.depth, 1e-12);
+      const double off = std::abs(rolled.conic.xx / expected.conic.xx - 1);
+      EXPECT_GT(off + std::abs(rolled.conic.yy / expected.conic.yy - 1), 1e-3) << "stretched with the shutter";
+    }
+  }
+}
+
+// By a parallel projection, in the middle of the image at half time.
+TEST(ProjectGaussian, WhatMovesWithTheShutterIsCulled) {
+  Scene<double> scene = single_gaussian();
+  scene.camera.lens = lens_of({LensModel::kOrthographic, 40, 30, 5, 5, 20, 15, {}});
+  scene.camera.shutter = Shutter::kTopToBottom;
+  const double* view = scene.camera.view;
+  for (const auto& [share, seen] : std::vector<std::pair<double, bool>>{{-3, true}, {0.5, true}, {0.95, false}}) {
+    const double moves = share * 29 / 5, point[3] = {0, -moves / 2, 3};
+    std::copy_n(view, 16, scene.camera.view_end);
+    scene.camera.view_end[13] += moves;
+    for (int axis = 0; axis < 3; ++axis) {
+      scene.means3D[axis] = 0;
+      for (int k = 0; k < 3; ++k) scene.means3D[axis] += view[4 * axis + k] * (point[k] - view[12 + k]);
+    }
+    EXPECT_EQ(project(scene).radius > 0, seen) << share;
+  }
+}
+
+// However wildly the camera turns: where Newton's steps end elsewhere, nothing is drawn.
+TEST(ProjectGaussian, WhatARollingShutterShowsIsSeenAtTheTimeOfItsRow) {
+  Random random(12);
+  for (const Lens<double>& lens : make_lenses(40, 30)) {
+    int shown = 0;
+    for (int i = 0; i < 2000; ++i) {
+      Scene<double> scene = single_gaussian();
+      scene.scales = {0.01, 0.01, 0.01};
+      scene.camera.lens = lens;
+      for (double& place : scene.means3D) place = random.uniform(-3, 3);
+      set_shutter(scene.camera, kRolling[i % 4]);
+      for (double& number : scene.camera.view_end) number += random.uniform(-0.7, 0.7);
+      if (project(scene).radius == 0) continue;
+      const Vec2<double> at = project(scene).gaussian.mean;
+      const bool columns =
+          scene.camera.shutter == Shutter::kLeftToRight || scene.camera.shutter == Shutter::kRightToLeft;
+      double time = columns ? at.x / 39 : at.y / 29;
+      if (scene.camera.shutter == Shutter::kBottomToTop || scene.camera.shutter == Shutter::kRightToLeft)
+        time = 1 - time;
+      if (time < kFirstTime || time > kLastTime) continue;
+      double pose[16];
+      for (int k = 0; k < 16; ++k) {
+        pose[k] = scene.camera.view[k] + time * (scene.camera.view_end[k] - scene.camera.view[k]);
+      }
+      const Vec2<double> then = through_lens(lens, transform_point(pose, load3(&scene.means3D[0]))).pixel;
+      EXPECT_LT(std::hypot(then.x - at.x, then.y - at.y), 1) << i << " by " << kLensNames[int(lens.model)];
+      ++shown;
+    }
+    EXPECT_GT(shown, 100);
+  }
+}
+
 TEST(ProjectGaussian, BeyondTheRangeOfALensIsCulledAndNotFoldedBack) {
   Scene<double> scene = single_gaussian();
   const double* view = scene.camera.view;

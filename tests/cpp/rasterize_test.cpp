@@ -536,6 +536,26 @@ TYPED_TEST(RasterizeIn, TheHalvesDoWhatTheWholeDoes) {
   EXPECT_EQ(actual.flat(), expected.flat());
 }
 
+TEST(MarkVisible, WithARollingShutterTakesTheNearPlaneOfEitherPose) {
+  const Scene<double> scene = make_scene(34, 200, 37, 29);
+  const auto marked = [&](const Camera<double>& camera) {
+    const std::unique_ptr<bool[]> visible(new bool[scene.count]);
+    cpu::Frame<double> frame;
+    frame.inputs = scene.inputs(), frame.camera = camera;
+    cpu::mark_visible(frame, visible.get());
+    return std::vector<bool>(visible.get(), visible.get() + scene.count);
+  };
+  for (const double step : {-0.7, 0.7}) {  // towards the points, and away from them
+    Camera<double> rolling = scene.camera, last = scene.camera;
+    set_shutter(rolling, Shutter::kTopToBottom);
+    rolling.view_end[14] += step;
+    std::copy_n(rolling.view_end, 16, last.view);
+    const std::vector<bool> first = marked(scene.camera), second = marked(last), either = marked(rolling);
+    EXPECT_NE(first, second);
+    for (int64_t i = 0; i < scene.count; ++i) EXPECT_EQ(either[i], first[i] || second[i]);
+  }
+}
+
 TEST(MarkVisible, IsTheNearPlaneTest) {
   const Scene<double> scene = make_scene(34, 200, 37, 29);
   const std::unique_ptr<bool[]> visible(new bool[scene.count]);

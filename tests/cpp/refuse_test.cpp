@@ -70,6 +70,11 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
       {[](auto& f) { f.camera.tan_fov_y = 0; }, "tan_fov_y (tanfovy) is 0; it must be positive and finite"},
       {[](auto& f) { f.camera.tan_fov_x = HUGE_VALF; }, "tan_fov_x (tanfovx) is inf; it must be positive and finite"},
       {[](auto& f) { f.camera.near = NAN; }, "near is nan; it must be 0 or more and finite"},
+      {[](auto& f) { f.camera.shutter = static_cast<Shutter>(7); },
+       "camera.shutter (rolling_shutter) is 7; it must be 0 to 4"},
+      {[](auto& f) { f.camera.shutter = Shutter::kTopToBottom; },
+       "camera.shutter is top_to_bottom, but camera.lens is a pinhole; it must be another lens, such as opencv without "
+       "distortion"},
       {[](auto& f) { f.config.scale_modifier = -2; }, "scale_modifier is -2; it must be 0 or more and finite"},
       {[](auto& f) { f.config.low_pass = HUGE_VALF; }, "low_pass is inf; it must be 0 or more and finite"},
       {[](auto& f) { f.config.background = nullptr; }, "background is null; it must point to an array [C]"},
@@ -80,6 +85,11 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
       {[](auto& f) { f.images.inverse_depth = nullptr; },
        "images.inverse_depth is null; it must point to an array [H, W], as config.inverse_depth is set"},
       {[](auto& f) { f.images.radii = nullptr; }, "images.radii is null; it must point to an array [N]"}};
+}
+
+template <class AnyCamera> void roll(AnyCamera& camera) {
+  camera.shutter = Shutter::kTopToBottom;
+  camera.lens.model = LensModel::kOpencv, camera.lens.focal = {1, 1};
 }
 
 TEST(Refuse, AForwardPassOnTheCpuNamesWhatIsWrong) {
@@ -98,6 +108,8 @@ TEST(Refuse, AForwardPassOnTheCpuNamesWhatIsWrong) {
                    "camera.projection (projmatrix)[15] is inf; it must be finite"});
   cases.push_back(
       {[](Frame& f) { f.camera.position[1] = NAN; }, "camera.position (campos)[1] is nan; it must be finite"});
+  cases.push_back({[](Frame& f) { roll(f.camera), f.camera.view_end[2] = NAN; },
+                   "camera.view_end (viewmatrix_end)[2] is nan; it must be finite"});
   for (const auto& c : cases) {
     Frame frame = frame_of(scene, rendering);
     c.spoil(frame);
@@ -116,6 +128,7 @@ TEST(Refuse, AFrameOfDevicePointersIsHeldToTheSame) {
       {[](Frame& f) { f.camera.projection = nullptr; }, "camera.projection is null; it must point to an array [4, 4]"});
   cases.push_back(
       {[](Frame& f) { f.camera.position = nullptr; }, "camera.position is null; it must point to an array [3]"});
+  cases.push_back({[](Frame& f) { roll(f.camera); }, "camera.view_end is null; it must point to an array [4, 4]"});
   Frame good;
   good.inputs = scene.inputs(), good.config = scene.raster_config(), good.images = rendering.images();
   good.config.blend.background_gate_at = reinterpret_cast<const float*>(8);  // of the device: the host must not read it

@@ -71,7 +71,7 @@ template <class S> std::vector<S> contributions_at(const SimdLevel& level, const
   std::vector<Contribution<S>> out(r.instances.size(), Contribution<S>{-1, -1, -1, -1});
   const ContributionPass<S> pass = {{pixel_weights.data(), {}}};
   for_each_tile(config, saved, camera.width, camera.height, 0, [&](const Tile<S>& tile, S* scratch) {
-    return kernels_of<S>(level).contributions(tile, pass, out.data(), scratch);
+    return kernels_of<S>(level).template of_pass<ContributionPass<S>>()(tile, pass, out.data(), scratch);
   });
   std::vector<S> flat;
   for (const auto& c : out) flat.insert(flat.end(), {c.pixel_weight, c.pixels, c.blend_weight, c.distance});
@@ -90,7 +90,7 @@ template <class S> std::vector<S> importance_at(const SimdLevel& level, const Sc
   std::vector<Importance<S>> out(r.instances.size(), Importance<S>{-1, -1, -1});
   for_each_tile(config, saved, scene.camera.width, scene.camera.height, kImportanceArrays + 2 * config.num_channels,
                 [&](const Tile<S>& tile, S* scratch) {
-                  return kernels_of<S>(level).importance(tile, {map}, out.data(), scratch);
+                  return kernels_of<S>(level).template of_pass<ImportancePass<S>>()(tile, {map}, out.data(), scratch);
                 });
   std::vector<S> flat;
   for (const auto& i : out) flat.insert(flat.end(), {i.share, i.squared_share, i.removal_cost});

@@ -57,6 +57,7 @@ template <class S> struct Scene {
     visit(camera.view, size_t(16));
     visit(camera.projection, size_t(16));
     visit(camera.position, size_t(3));
+    visit(camera.view_end, size_t(16));
   }
 
   std::vector<S> flat() {
@@ -113,6 +114,21 @@ inline std::vector<Lens<double>> make_lenses(int width, int height) {
           lens(LensModel::kEquirectangular, 0, {})};
 }
 
+// Turns and shifts the camera by some pixels while the image is read out.
+template <class S> void set_shutter(Camera<S>& camera, Shutter shutter) {
+  camera.shutter = shutter;
+  std::copy_n(camera.view, 16, camera.view_end);
+  const S turn[3] = {S(0.03), S(-0.05), S(0.04)}, shift[3] = {S(0.1), S(-0.12), S(0.08)};
+  for (int row = 0; row < 4; ++row) {
+    const S *from = camera.view + 4 * row, x = from[0], y = from[1], z = from[2];
+    S* to = camera.view_end + 4 * row;
+    to[0] += turn[1] * z - turn[2] * y, to[1] += turn[2] * x - turn[0] * z, to[2] += turn[0] * y - turn[1] * x;
+    for (int k = 0; row == 3 && k < 3; ++k) to[k] += shift[k];
+  }
+}
+constexpr Shutter kRolling[] = {Shutter::kTopToBottom, Shutter::kLeftToRight, Shutter::kBottomToTop,
+                                Shutter::kRightToLeft};
+
 // Odd seeds have a gate for the background. Gaussians around the origin: some off the image or behind the camera, some
 // more than opaque, some not there at all.
 inline Scene<double> make_scene(unsigned seed, int count, int width, int height) {
@@ -142,6 +158,7 @@ template <class To, class From> Scene<To> convert(const Scene<From>& from) {
   to.camera.tan_fov_x = To(from.camera.tan_fov_x), to.camera.tan_fov_y = To(from.camera.tan_fov_y);
   to.camera.near = To(from.camera.near);
   to.camera.lens = from.camera.lens.template as<To>();
+  to.camera.shutter = from.camera.shutter;
   to.config.blend = from.config.blend.template as<To>();
   to.config.num_channels = from.config.num_channels;
   to.config.scale_modifier = To(from.config.scale_modifier);
@@ -159,6 +176,7 @@ template <class To, class From> Scene<To> convert(const Scene<From>& from) {
   std::copy(from.camera.view, from.camera.view + 16, to.camera.view);
   std::copy(from.camera.projection, from.camera.projection + 16, to.camera.projection);
   std::copy(from.camera.position, from.camera.position + 3, to.camera.position);
+  std::copy(from.camera.view_end, from.camera.view_end + 16, to.camera.view_end);
   return to;
 }
 
@@ -284,6 +302,7 @@ template <class S> struct SceneGradient {
     std::copy(camera.view, camera.view + 16, by.camera.view);
     std::copy(camera.projection, camera.projection + 16, by.camera.projection);
     std::copy(camera.position, camera.position + 3, by.camera.position);
+    std::copy(camera.view_end, camera.view_end + 16, by.camera.view_end);
     return by.flat();
   }
 };

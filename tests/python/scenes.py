@@ -16,9 +16,10 @@ from diff_smoe_rasterization.settings import (
     resolve_background_gate,
     resolve_faint_below,
     resolve_lens,
+    resolve_shutter,
 )
 
-CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
+CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos", "viewmatrix_end")
 BACKGROUND_GATES = {"eq7_gate": ("smoe_eq7", 0.05), "smoe_learned_gate": ("smoe", torch.tensor(0.25, device="cpu"))}
 """Further modes of the tests: a blend mode and its background gate, a number and a tensor."""
 with_gate = pytest.mark.parametrize("mode", BLEND_MODES + ("smoe_learned_gate",))
@@ -115,6 +116,15 @@ def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, princi
         campos=position.to(dtype), prefiltered=False, debug=False, blend_mode=blend_mode, **fields)
 
 
+def turned(view, angles, shift):
+    """Returns a view matrix, transposed, after a further turn around x, y and z and a shift, both in view space."""
+    x, y, z = angles
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64))
+    turn = turn.to(view)
+    return torch.cat([torch.cat([view[:3, :3] @ turn.T, (view[3:, :3] @ turn.T) + view.new_tensor([shift])]),
+                      view[:, 3:]], 1)
+
+
 def random_scene(mode, num_gaussians=120, width=50, height=37, seed=0, degree=2, channels=None, covariance="scales",
                  split_dc=False, scale=0.12, opacity=(0.02, 1.2), dtype=torch.float64, **camera):
     """Returns a scene of a random cloud in a box that is larger than the view, so that about a third is out of sight.
@@ -196,7 +206,7 @@ def op_arguments(scene, op="rasterize", **others):
     learned = isinstance(gate, torch.Tensor)
     camera_model, lens = resolve_lens(scene.settings)
     values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode), "camera_model": camera_model,
-              "lens": lens,
+              "lens": lens, "rolling_shutter": resolve_shutter(scene.settings),
               "faint_below": resolve_faint_below(mode, scene.settings.faint_below),
               **dict.fromkeys(FEATURE_OUTPUTS, True),
               "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,

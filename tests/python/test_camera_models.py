@@ -282,6 +282,10 @@ FISHEYE = dict(camera_model="fisheye")
     (dict(principal_point=(3.0, 4.0)), "principal_point is .*'pinhole'; its principal point is in projmatrix"),
     (dict(distortion=(0.1, 0.2, 0.3), **FISHEYE), "distortion has 3 numbers; it must have 0, 1, 2 or 4: k1 k2 k3 k4"),
     (dict(distortion=(0.1, math.nan), **FISHEYE), r"distortion\[1\] is nan; it must be finite"),
+    (dict(distortion=None, **FISHEYE), "distortion is None; it must be a sequence of numbers"),
+    (dict(distortion=0.1, **FISHEYE), "distortion is 0.1; it must be a sequence of numbers"),
+    (dict(distortion="12", **FISHEYE), "distortion is '12'; it must be a sequence of numbers"),
+    (dict(distortion=torch.ones(2, requires_grad=True), **FISHEYE), "distortion requires a gradient, .* detach it"),
     (dict(distortion=("a",), **FISHEYE), r"distortion is \('a',\); it must be a sequence of numbers"),
     (dict(principal_point=(3.0,), **FISHEYE), r"principal_point is \(3.0,\); it must be two numbers"),
     (dict(principal_point=(3.0, math.inf), **FISHEYE), "principal_point is 3, inf; it must be finite"),
@@ -304,4 +308,13 @@ def test_settings_from_camera_of_a_lens():
         settings_from_camera(K, R, t, 40, 30, camera_model="equirectangular")
     with pytest.raises(ValueError, match="camera_model is 'kannala'; it must be one of"):
         settings_from_camera(K, R, t, 40, 30, camera_model="kannala")
+    with pytest.raises(ValueError, match="K is None; only an equirectangular camera has none"):
+        settings_from_camera(None, R, t, 40, 30, camera_model="fisheye")
+    with pytest.raises(ValueError, match="distortion is None; it must be a sequence of numbers"):
+        settings_from_camera(K, R, t, 40, 30, camera_model="fisheye", distortion=None)
+    with pytest.raises(ValueError, match="K requires a gradient, but a lens has none; detach it"):
+        settings_from_camera(torch.eye(3).requires_grad_(), R, t, 40, 30, camera_model="fisheye")
+    for numbers in (torch.tensor([0.5, 0.25]), np.array([0.5, 0.25])):
+        settings = settings_from_camera(K, R, t, 40, 30, camera_model="fisheye", distortion=numbers)
+        assert settings.distortion == (0.5, 0.25)
     assert camera_settings(40, 30).camera_model == "pinhole"

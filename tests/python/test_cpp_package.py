@@ -247,19 +247,22 @@ def shows_a_model(program, folder):
     count, degree = 200, 2
     model = diff_smoe_rasterization.io.Gaussians(
         means3D=random.randn(count, 3), dc=random.rand(count, 1, 3), shs=random.randn(count, 8, 3) * 0.2,
-        opacity_logits=random.randn(count, 1), log_scales=random.randn(count, 3) * 0.3 - 2,
-        rotations=random.randn(count, 4), blend_mode="smoe", background_gate=0.05)
+        opacity_logits=random.randn(count, 1), log_scales=random.randn(count, 3) * 0.3 - 2.5,
+        rotations=random.randn(count, 4), blend_mode="smoe", background_gate=0.05, comments=("faint_below 2",))
     diff_smoe_rasterization.io.write_gaussians(str(folder / "model.ply"), model)
     run(program, folder / "model.ply", folder / "image.ppm")
     settings = diff_smoe_rasterization.settings_from_camera(
         [[400, 0, 200], [0, 400, 150], [0, 0, 1]], torch.eye(3), torch.tensor([0.0, 0.0, 4.0]), 400, 300,
-        blend_mode="smoe", background_gate=0.05, sh_degree=degree)
+        blend_mode="smoe", background_gate=0.05, faint_below=2.0, sh_degree=degree)
     tensors = {name: torch.tensor(getattr(model, name), dtype=torch.float32)
                for name in ("means3D", "dc", "shs", "opacity_logits", "log_scales", "rotations")}
-    expected = diff_smoe_rasterization.rasterize(
-        settings=settings, means3D=tensors["means3D"], shs=torch.cat([tensors["dc"], tensors["shs"]], dim=1),
-        opacities=tensors["opacity_logits"].sigmoid(), scales=tensors["log_scales"].exp(),
-        rotations=torch.nn.functional.normalize(tensors["rotations"])).color
+    arguments = {
+        "means3D": tensors["means3D"], "shs": torch.cat([tensors["dc"], tensors["shs"]], dim=1),
+        "opacities": tensors["opacity_logits"].sigmoid(), "scales": tensors["log_scales"].exp(),
+        "rotations": torch.nn.functional.normalize(tensors["rotations"])}
+    expected = diff_smoe_rasterization.rasterize(settings=settings, **arguments).color
+    usual = diff_smoe_rasterization.rasterize(settings=settings._replace(faint_below=None), **arguments).color
+    assert (usual - expected).abs().max() > 3 / 255, "the image tells whether faint_below is the file's"
     with Image.open(folder / "image.ppm") as image:
         shown = np.asarray(image).astype(int)
     assert expected.mean() > 0.1
@@ -281,6 +284,11 @@ def test_the_cpp_trainer_is_as_good_as_pythons(tmp_path_factory, tmp_path, optio
         build(ROOT / "examples" / "libtorch", folder, "-DCMAKE_BUILD_TYPE=Release")
     write_synthetic_scene(str(tmp_path / "scene"), views=24, width=100, height=75, points=1000, supersampling=1)
     printed = run(folder / "train", tmp_path / "scene", tmp_path / "cpp", "--iterations", "300", *options)
+    if not options:
+        wrong = subprocess.run([str(folder / "train"), str(tmp_path / "scene"), str(tmp_path / "no"), "--blend-mode",
+                                "smo"], stderr=subprocess.PIPE, universal_newlines=True)
+        assert wrong.returncode == 1 and "'smo'; it must be one of alpha" in wrong.stderr
+        assert wrong.stderr.count("\n") == 1, "without the trace of LibTorch's errors"
     ours = float(re.search(r"test PSNR ([0-9.]+) dB", printed).group(1))
     assert main(["train", str(tmp_path / "scene"), "-o", str(tmp_path / "python"), "--iterations", "300", "--quiet",
                  "--strategy", "3dgs", "--scale-recipe", *options]) == 0

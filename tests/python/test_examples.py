@@ -4,6 +4,7 @@ from __future__ import annotations
 import ast
 import base64
 import contextlib
+import dataclasses
 import io as io_of_text
 import json
 import os
@@ -70,6 +71,19 @@ def test_further_images_are_written(model, tmp_path):
     assert 0.2 < nearest < farthest < 12, "within the room, which is 8 units wide"
 
 
+@pytest.mark.parametrize("name", ["render_ply.py", "further_images.py"])
+def test_a_camera_that_sees_nothing_is_told(model, tmp_path, name):
+    with pytest.raises(SystemExit, match="no Gaussian is seen from there; --eye X Y Z and --target"):
+        run(name, model[0], "--eye", 0, 50, 0, "--target", 1, 90, 0, folder=tmp_path)
+
+
+def test_a_model_of_the_paper_is_rendered_by_its_rule(model, tmp_path):
+    load = runpy.run_path(str(EXAMPLES / "render_ply.py"))["load"]
+    path = tmp_path / "paper.ply"
+    io.write_gaussians(path, dataclasses.replace(io.read_gaussians(model[0]), comments=("faint_below 2",)))
+    assert load(path)[1]["faint_below"] == 2.0 and "faint_below" not in load(model[0])[1]
+
+
 def test_two_apis_render_the_same_image(tmp_path):
     text = run("other_apis.py", folder=tmp_path)
     seen, difference = re.fullmatch(r"(\d+) of 500 Gaussians are seen; the two images differ by (\S+) on average\n",
@@ -125,3 +139,14 @@ def run_cell(source, variables):
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     exec(compile(tree, "cell", "exec"), variables)
     return None if last is None else eval(compile(ast.Expression(last.value), "cell", "eval"), variables)
+
+
+def test_one_place_through_five_lenses(model, tmp_path):
+    """All look at one point, which lies in the middle of each panel."""
+    run("lenses.py", model[0], "-o", "lenses.png", folder=tmp_path)
+    sheet = np.asarray(Image.open(tmp_path / "lenses.png")).astype(float)
+    assert sheet.shape == (499, 796, 3)
+    panels = [sheet[22:217, left:left + 260] for left in (0, 268, 536)] + [sheet[239:499, :260], sheet[239:499, 268:]]
+    middles = [panel[len(panel) // 2 - 1:, panel.shape[1] // 2 - 1:][:3, :3].mean((0, 1)) for panel in panels]
+    assert np.abs(middles - middles[0]).max() < 30, "levels of 255"
+    assert all(np.abs(panel - panels[0]).mean() > 5 for panel in panels[1:3]) and panels[4].std() > 10

@@ -21,13 +21,14 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.core import _core
-from diff_smoe_rasterization.footprints import image_numbers
+from diff_smoe_rasterization.footprints import camera_tensors, image_numbers
 from diff_smoe_rasterization.settings import (
     _FIXED_GATES,
     BLEND_MODES,
     CAMERA_MODELS,
     FEATURE_OUTPUTS,
     OUTPUTS,
+    ROLLING_SHUTTERS,
     GaussianRasterizationSettings,
     resolve_faint_below,
 )
@@ -182,7 +183,8 @@ def test_the_settings_and_the_op_have_the_same_fields():
     """A setting is a line of csrc/torch/fields.h and a field of this name; these options are not settings."""
     options = set(_core.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward", "lens"}
     fields = set(GaussianRasterizationSettings._fields) - {"distortion", "principal_point"}  # which are `lens`
-    assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
+    assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "viewmatrix_end",
+                                "background_gate"}  # tensors
     assert fields - options <= set(_core.inputs) and options <= fields
 
 
@@ -196,6 +198,7 @@ def test_the_blend_modes_have_the_numbers_and_the_background_gates_of_the_core()
 
 def test_the_camera_models_have_the_numbers_of_the_core():
     assert _core.camera_models == CAMERA_MODELS
+    assert _core.rolling_shutters == ROLLING_SHUTTERS
 
 
 @on_every_device
@@ -355,8 +358,8 @@ def every_call():
     image_gradients = {name: value for name, value in backward.items() if name.startswith("dL_d")}
     inputs = {name: backward[name] for name in ("inputs", "present")}
     belongs = [here and name not in ("bg", "background_gate") for name, here in zip(_core.inputs, inputs["present"])]
-    camera = [scene.settings.viewmatrix, scene.settings.projmatrix, scene.settings.campos]
-    view = {"cameras": camera, "images": image_numbers(scene.settings), "depth": False, "inverse_depth": False}
+    cameras = camera_tensors(scene.settings)
+    view = {"cameras": cameras, "images": image_numbers(scene.settings), "depth": False, "inverse_depth": False}
     counted = {"radii": torch.zeros(1, 20, dtype=torch.int32), "offsets": torch.tensor([[0, 1]], dtype=torch.int32)}
     wide = torch.zeros(1, 4)
     depth = random_normal((20,), 1, torch.float32)

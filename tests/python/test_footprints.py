@@ -16,7 +16,7 @@ from scenes import (
 
 from diff_smoe_rasterization import Footprints, blend_footprints, project_gaussians, rasterize
 from diff_smoe_rasterization.arguments import op_arguments
-from diff_smoe_rasterization.footprints import image_numbers
+from diff_smoe_rasterization.footprints import camera_tensors, image_numbers
 from diff_smoe_rasterization.settings import OUTPUTS
 from dsmoe.distributed.rows import ViewRows
 
@@ -156,7 +156,7 @@ def test_views_of_a_batch_without_rows_or_gaussians():
 
 
 @pytest.mark.parametrize("change, message", [
-    (dict(images=[1.0]), "cameras and images have lengths 3 and 1; they must have 3 tensors and 20 numbers a view"),
+    (dict(images=[1.0]), "cameras and images have lengths 4 and 1; they must have 4 tensors and 21 numbers a view"),
     (dict(covariance="cov3D"), "cov3D_precomp is given; rows are of scales and rotations"),
     (dict(channels=3), "colors_precomp is given; rows are of shs or dc"),
     (dict(channels=5), "num_channels is 5; rows have 3"),
@@ -168,8 +168,7 @@ def test_rows_refuse_what_they_do_not_hold(change, message):
         name: change[name] for name in change if name == "dtype"}})
     arguments, options = op_arguments("project_gaussians", scene.settings, ("depth",) if "depth" in change else (),
                                       **scene.inputs)
-    camera = [scene.settings.viewmatrix, scene.settings.projmatrix, scene.settings.campos]
-    images = change.get("images", image_numbers(scene.settings))
+    camera, images = camera_tensors(scene.settings), change.get("images", image_numbers(scene.settings))
     with pytest.raises((ValueError, TypeError), match=f"count_rows: {message}"):
         torch.ops.diff_smoe_rasterization.count_rows(*arguments, *options, True, camera, images)
 

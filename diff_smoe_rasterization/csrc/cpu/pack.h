@@ -1,9 +1,8 @@
 // A pack of pixels that behaves like one number, so that the mathematics of include/dsmoe works on it.
 //
-// Included once per instruction set, by a file that has set DSMOE_SIMD (the namespace, so that each set's code has
-// its own symbols) and DSMOE_SIMD_BYTES (the register's size: 64 is AVX-512, 32 is AVX2 with FMA, 16 any machine). It
-// uses the compilers' vector types. If those make poor masks or no FMA, it uses intrinsics. The compilers' own
-// macros (__AVX2__ ...) cannot choose: GCC expands them before it sees the target pragma.
+// Included once per instruction set (simd_target.h). It uses the compilers' vector types, and intrinsics where those
+// make poor masks or no FMA. The compilers' own macros (__AVX2__ ...) cannot choose: GCC expands them before it sees
+// the target pragma.
 #pragma once
 
 #include <cstdint>

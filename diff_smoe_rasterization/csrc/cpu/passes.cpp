@@ -18,8 +18,9 @@ template <class Pass> constexpr int kScratchFeatures = std::max(Pass::template S
 
 // Runs a pass without sums, and the tiles of one with sums. num_features: how many the scratch memory has room for.
 template <class S, class Pass>
-void walk_tiles(const Frame<S>& frame, const Pass& pass, PassKernel<S, Pass> kernel, int num_features,
+void walk_tiles(const Frame<S>& frame, const Pass& pass, int num_features = kScratchFeatures<Pass>,
                 typename Pass::template Sums<S>* records = nullptr) {
+  const auto kernel = tile_kernels<S>().template of_pass<Pass>();
   for_each_tile(frame.config, frame.saved, frame.camera.width, frame.camera.height, num_features,
                 [&](const Tile<S>& tile, S* scratch) { return kernel(tile, pass, records, scratch); });
 }
@@ -30,14 +31,14 @@ constexpr int64_t kGaussianChunk = 4096;  // a few additions each
 // side by side, in double: a large one has thousands of instances. There are no atomics, so the result does not depend
 // on the threads.
 template <class S, class Pass>
-void sum_pixels(const Frame<S>& frame, const Pass& pass, PassKernel<S, Pass> kernel, int num_features) {
+void sum_pixels(const Frame<S>& frame, const Pass& pass, int num_features = kScratchFeatures<Pass>) {
   using Record = typename Pass::template Sums<S>;
   const int64_t num_gaussians = frame.inputs.num_gaussians;
   std::vector<typename Pass::template Sums<double>> totals(num_gaussians);
   for_each_band(frame, nullptr, [&](const Frame<S>& band) {
     const int64_t* slots = band.saved.instance_offsets;
     const std::unique_ptr<Record[]> records(new Record[slots[num_gaussians]]);
-    walk_tiles(band, pass, kernel, num_features, records.get());
+    walk_tiles(band, pass, num_features, records.get());
     parallel_for(frame.config.num_threads, num_gaussians, kGaussianChunk, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
         for (int64_t slot = slots[i]; slot < slots[i + 1]; ++slot) {
@@ -64,21 +65,21 @@ void sum_pixels(const Frame<S>& frame, const Pass& pass, PassKernel<S, Pass> ker
 }  // namespace
 
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map) {
-  refuse_contributions("cpu::contributions", frame, map);
-  sum_pixels(frame, ContributionPass<S>{map}, tile_kernels<S>().contributions, kScratchFeatures<ContributionPass<S>>);
+  const ContributionPass<S> pass = {map};
+  refuse_pass("cpu::contributions", frame, pass);
+  sum_pixels(frame, pass);
 }
 
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map) {
-  refuse_importance("cpu::importance", frame, map);
-  sum_pixels(frame, ImportancePass<S>{map}, tile_kernels<S>().importance,
-             kImportanceArrays + 2 * frame.config.num_channels);
+  const ImportancePass<S> pass = {map};
+  refuse_importance("cpu::importance", frame, pass);
+  sum_pixels(frame, pass, kImportanceArrays + 2 * frame.config.num_channels);
 }
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map) {
-  refuse_gate_map("cpu::gate_map", frame, map);
-  for_each_band(frame, nullptr, [&](const Frame<S>& band) {
-    walk_tiles(band, gate_map_pass<S>(frame, map), tile_kernels<S>().gate_map, kScratchFeatures<GateMapPass<S>>);
-  });
+  const GateMapPass<S> pass = gate_map_pass<S>(frame, map);
+  refuse_pass("cpu::gate_map", frame, pass);
+  for_each_band(frame, nullptr, [&](const Frame<S>& band) { walk_tiles(band, pass); });
 }
 
 #define DSMOE_INSTANTIATE(S)                                               \

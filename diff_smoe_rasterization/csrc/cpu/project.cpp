@@ -72,8 +72,12 @@ template <class S> int64_t count_instances(const Frame<S>& frame, StageTimes* ti
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible) {
   refuse_mark_visible("cpu::mark_visible", frame, visible);
   for (int64_t i = 0; i < frame.inputs.num_gaussians; ++i) {
-    const Vec3<S> view = transform_point(frame.camera.view, load3(frame.inputs.means3D + 3 * i));
-    visible[i] = view_depth(frame.camera.lens.model, view) > frame.camera.near;
+    const Camera<S>& camera = frame.camera;
+    const auto beyond = [&](const S* view) {
+      const Vec3<S> point = transform_point(view, load3(frame.inputs.means3D + 3 * i));
+      return view_depth(camera.lens.model, point) > camera.near;
+    };
+    visible[i] = beyond(camera.view) || (camera.shutter != Shutter::kGlobal && beyond(camera.view_end));
   }
 }
 

@@ -51,13 +51,22 @@ template <class S, class Pass>
 using PassKernel = int64_t (*)(const Tile<S>& tile, const Pass& pass, typename Pass::template Sums<S>* records,
                                S* scratch);
 
+template <class... Passes> struct PassList {};
+template <class S> using AllPasses = PassList<ContributionPass<S>, ImportancePass<S>, GateMapPass<S>>;
+
+template <class S, class Pass> struct KernelOfPass { PassKernel<S, Pass> kernel; };
+template <class S, class List> struct KernelsOfPasses;
+template <class S, class... Passes> struct KernelsOfPasses<S, PassList<Passes...>> : KernelOfPass<S, Passes>... {};
+
 // All return the number of (Gaussian, pixel) pairs whose exponent they evaluated. scratch: 64-byte aligned.
 template <class S> struct TileKernels {
   int64_t (*forward)(const Tile<S>& tile, const ImageOutputs<S>& images, S* scratch);
   int64_t (*backward)(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch);
-  PassKernel<S, ContributionPass<S>> contributions;
-  PassKernel<S, ImportancePass<S>> importance;
-  PassKernel<S, GateMapPass<S>> gate_map;
+  KernelsOfPasses<S, AllPasses<S>> passes;
+
+  template <class Pass> PassKernel<S, Pass> of_pass() const {
+    return static_cast<const KernelOfPass<S, Pass>&>(passes).kernel;
+  }
 };
 
 // Those of each instruction set that the compiler can build for. Double has none of AVX-512, nor much optimization

@@ -234,7 +234,7 @@ int64_t importance_of_tile(const Tile<S>& tile, const ImportanceMap<S>& map, Imp
 }
 
 template <class S>
-int64_t importance(const Tile<S>& tile, const ImportancePass<S>& pass, Importance<S>* records, S* scratch) {
+int64_t pass(const Tile<S>& tile, const ImportancePass<S>& pass, Importance<S>* records, S* scratch) {
   int64_t pairs = 0;
   dispatch_blend(tile.config.blend.mode, tile.config.num_channels, [&](auto mode, auto channels) {
     constexpr BlendMode kMode = decltype(mode)::value;

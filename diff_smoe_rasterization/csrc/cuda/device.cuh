@@ -25,18 +25,31 @@ template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Pinh
     to.near = from.near;
   }
 }
-template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Camera<S>& to) {
+template <class S> __device__ void load_camera(const DeviceCamera<S>& from, LensCamera<S>& to) {
   load_camera<S>(from, static_cast<PinholeCamera<S>&>(to));
   if (threadIdx.x == 0) to.lens = from.lens;
 }
-
-// Calls body(TypeOf<PinholeCamera<S>>) or, if there is a lens, body(TypeOf<Camera<S>>): a kernel for pinholes alone
-// needs less registers.
-template <class T> struct TypeOf { using type = T; };
-template <class S, class Body> void dispatch_camera(bool lens, const Body& body) {
-  lens ? body(TypeOf<Camera<S>>{}) : body(TypeOf<PinholeCamera<S>>{});
+template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Camera<S>& to) {
+  load_camera<S>(from, static_cast<LensCamera<S>&>(to));
+  if (threadIdx.x == 0) to.shutter = from.shutter;
+  if (from.shutter == Shutter::kGlobal) return;
+  for (int i = threadIdx.x; i < 16; i += blockDim.x) to.view_end[i] = from.view_end[i];
 }
-template <class S> bool has_lens(const DeviceCamera<S>& camera) { return camera.lens.model != LensModel::kPinhole; }
+
+// How much of a camera a kernel knows. A kernel for pinholes alone needs the fewest registers.
+enum class CameraKind { kPinhole, kLens, kShutter };
+template <class S> CameraKind kind_of(const DeviceCamera<S>& camera) {
+  if (camera.shutter != Shutter::kGlobal) return CameraKind::kShutter;
+  return camera.lens.model != LensModel::kPinhole ? CameraKind::kLens : CameraKind::kPinhole;
+}
+
+// Calls body(TypeOf<PinholeCamera<S>>), or with the LensCamera<S> or Camera<S> that is needed.
+template <class T> struct TypeOf { using type = T; };
+template <class S, class Body> void dispatch_camera(CameraKind kind, const Body& body) {
+  if (kind == CameraKind::kPinhole) return body(TypeOf<PinholeCamera<S>>{});
+  if (kind == CameraKind::kLens) return body(TypeOf<LensCamera<S>>{});
+  body(TypeOf<Camera<S>>{});
+}
 
 // Multiprocessors of the current device.
 inline int num_multiprocessors() {

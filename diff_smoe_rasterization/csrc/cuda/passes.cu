@@ -8,13 +8,15 @@ namespace dsmoe {
 namespace cuda {
 
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work) {
-  refuse_contributions("cuda::contributions", frame, map);
-  sum_pixels(frame, ContributionPass<S>{map}, work);
+  const ContributionPass<S> pass = {map};
+  refuse_pass("cuda::contributions", frame, pass);
+  sum_pixels(frame, pass, work);
 }
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work) {
-  refuse_gate_map("cuda::gate_map", frame, map);
-  walk_tiles(frame, gate_map_pass<S>(frame, map), work);
+  const GateMapPass<S> pass = gate_map_pass<S>(frame, map);
+  refuse_pass("cuda::gate_map", frame, pass);
+  walk_tiles(frame, pass, work);
 }
 
 #define DSMOE_INSTANTIATE(S)                                                            \

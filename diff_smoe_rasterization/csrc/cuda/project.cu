@@ -146,6 +146,7 @@ template <class S> struct VisibleArguments {
   const S* means3D;       // [N, 3] world
   const S* view;          // [4, 4] as Camera has it
   S near;                 // view depth; what is not beyond is not visible
+  const S* view_end;      // likewise; or null, if the shutter does not roll
   LensModel lens;         // which says what a depth is
   bool* visible;          // [N] written
 };
@@ -155,8 +156,12 @@ __global__ void __launch_bounds__(kStoreBlock)
     mark_visible_kernel(const __grid_constant__ VisibleArguments<S> arguments) {
   const int64_t i = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
   if (i >= arguments.num_gaussians) return;
-  const Vec3<S> view = transform_point(arguments.view, load3(arguments.means3D + 3 * i));
-  arguments.visible[i] = view_depth(arguments.lens, view) > arguments.near;
+  const Vec3<S> point = load3(arguments.means3D + 3 * i);
+  bool visible = view_depth(arguments.lens, transform_point(arguments.view, point)) > arguments.near;
+  if (arguments.view_end != nullptr) {
+    visible |= view_depth(arguments.lens, transform_point(arguments.view_end, point)) > arguments.near;
+  }
+  arguments.visible[i] = visible;
 }
 
 }  // namespace
@@ -171,7 +176,7 @@ template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, con
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
   arguments.order = order_targets(frame, depths);
-  dispatch_camera<S>(has_lens(frame.camera), [&](auto camera) {
+  dispatch_camera<S>(kind_of(frame.camera), [&](auto camera) {
     using AnyCamera = typename decltype(camera)::type;
     dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
       using Rows = typename decltype(type)::type;
@@ -204,7 +209,7 @@ template <class S> void project_radii(const Frame<S>& frame, const Work& work) {
   const int64_t count = frame.inputs.num_gaussians;
   if (count == 0) return;
   const RadiiArguments<S> arguments = {frame.inputs, frame.camera, frame.config, frame.images.radii};
-  dispatch_camera<S>(has_lens(frame.camera), [&](auto camera) {
+  dispatch_camera<S>(kind_of(frame.camera), [&](auto camera) {
     using AnyCamera = typename decltype(camera)::type;
     radii_kernel<AnyCamera><<<blocks_for(count, kRowsBlock), kRowsBlock, 0, work.stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("radii");
@@ -217,6 +222,7 @@ template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const
   arguments.num_gaussians = frame.inputs.num_gaussians;
   arguments.means3D = frame.inputs.means3D;
   arguments.view = frame.camera.view;
+  arguments.view_end = frame.camera.shutter == Shutter::kGlobal ? nullptr : frame.camera.view_end;
   arguments.near = frame.camera.near;
   arguments.lens = frame.camera.lens.model;
   arguments.visible = visible;

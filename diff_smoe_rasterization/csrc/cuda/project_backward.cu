@@ -7,8 +7,13 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
+// Whether a kernel for these cameras knows of rolling shutters.
+template <class AnyCamera, class S> constexpr bool kMayRoll = std::is_same_v<AnyCamera, Camera<S>>;
+
+// Numbers of the camera's gradient, of which the last 16 are those of a rolling shutter.
 constexpr int kCameraGradientSize = sizeof(CameraGradient<float>) / sizeof(float);
-static_assert(kCameraGradientSize == 35, "view, projection and position lie side by side");
+static_assert(kCameraGradientSize == 51, "view, projection, position and view_end lie side by side");
+DSMOE_HD constexpr int camera_columns(bool rolls) { return rolls ? kCameraGradientSize : kCameraGradientSize - 16; }
 
 template <class S> struct ProjectBackwardArguments {
   GaussianInputs<S> inputs;        // of the forward pass
@@ -20,14 +25,14 @@ template <class S> struct ProjectBackwardArguments {
   bool by_footprints;              // which are gradients by the footprints, not sums over pixels
   const S* dL_ddepths;             // [N] gradients by the view depths, added to those of the features; or null
   GaussianGradients<S> gradients;  // written
-  S* camera_rows;                  // [warps, kCameraGradientSize] each warp's sums, written; or null
+  S* camera_rows;                  // [warps, camera_columns()] each warp's sums, written; or null
 };
 
 // The sum over the warp of the camera's gradients.
-template <class S>
+template <bool kRolls, class S>
 __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, int64_t i,
                                  const CameraGradient<S>& dL_dcamera, int lane) {
-  S* out = arguments.camera_rows + (i / kWarp) * kCameraGradientSize;
+  S* out = arguments.camera_rows + (i / kWarp) * camera_columns(kRolls);
   const auto store_sums = [&](const auto& numbers) {
     for (const S number : numbers) {
       const S sum = sum_lanes(number);
@@ -36,6 +41,7 @@ __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, i
     }
   };
   store_sums(dL_dcamera.view), store_sums(dL_dcamera.projection), store_sums(dL_dcamera.position);
+  if constexpr (kRolls) store_sums(dL_dcamera.view_end);
 }
 
 template <class S> __device__ GateGradient<S> gate_of_moments(const ProjectedGaussian<S>& projected, const S* record) {
@@ -59,10 +65,16 @@ constexpr int kRecordLength = kNumGateMoments + kFastFeatures;  // of colours
 constexpr int kMostRecordLength = kRecordLength + kMostFurtherFeatures;
 using RecordRows = WarpRows<kRecordLength>;
 
+// Blocks of the common case that one multiprocessor holds at once.
+template <class AnyCamera, bool kCamera>
+constexpr int kKnownBackwardBlocks = kCamera                      ? kCameraBackwardBlocks
+                                     : kMayRoll<AnyCamera, float> ? kShutterBackwardBlocks
+                                                                  : kRowsBackwardBlocks;
+
 // The common case. The SH rows come through shared memory. So do the records if they are of colours only. All other
 // numbers live in registers.
 template <class AnyCamera, bool kCamera, bool kOnlyColors, class Rows>
-__global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : kRowsBackwardBlocks)
+__global__ void __launch_bounds__(kRowsBlock, kKnownBackwardBlocks<AnyCamera, kCamera>)
     known_backward_kernel(const __grid_constant__ ProjectBackwardArguments<float> arguments) {
   __shared__ AnyCamera camera;
   extern __shared__ float4 shared_rows[];
@@ -120,7 +132,7 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
     rows.write(dL_dsh);
   }
   store_gradients(gradient, rows, arguments.gradients, arguments.gradients.seen_only ? all_seen : rows.all());
-  if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
+  if constexpr (kCamera) store_camera_row<kMayRoll<AnyCamera, float>>(arguments, i, dL_dcamera, lane);
 }
 
 // Every other case. Staged SH rows leave their gradients in the same place.
@@ -182,7 +194,7 @@ __global__ void __launch_bounds__(kRowsBlock)
     const unsigned wanted = arguments.gradients.seen_only ? __ballot_sync(kAllLanes, seen) : rows.all();
     if (arguments.gradients.shs != nullptr) rows.store(arguments.gradients.shs + first * length, wanted);
   }
-  if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
+  if constexpr (kCamera) store_camera_row<kMayRoll<AnyCamera, S>>(arguments, i, dL_dcamera, lane);
 }
 
 template <class S> struct FinishArguments {
@@ -235,11 +247,12 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
   arguments.gradients = gradients;
   const bool with_camera = gradients.camera != nullptr;
   const int64_t blocks = blocks_for(inputs.num_gaussians, kRowsBlock), warps = blocks * (kRowsBlock / kWarp);
-  if (with_camera) arguments.camera_rows = allocate<S>(scratch, warps * kCameraGradientSize);
+  const int columns = camera_columns(kind_of(frame.camera) == CameraKind::kShutter);
+  if (with_camera) arguments.camera_rows = allocate<S>(scratch, warps * columns);
   if (inputs.num_gaussians > 0) {
     const bool aligned = are_vector_aligned(dL_dgaussians, gradients.shs, gradients.dc, gradients.means3D,
                                             gradients.means2D, gradients.scales, gradients.rotations);
-    dispatch_camera<S>(has_lens(frame.camera), [&](auto camera) {
+    dispatch_camera<S>(kind_of(frame.camera), [&](auto camera) {
       using AnyCamera = typename decltype(camera)::type;
       dispatch_sh_rows(inputs, aligned, [&](auto type, size_t shared) {
         using Rows = typename decltype(type)::type;
@@ -264,7 +277,7 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
     });
   }
   if (with_camera) {
-    sum_columns(arguments.camera_rows, warps, kCameraGradientSize, reinterpret_cast<S*>(gradients.camera), stream);
+    sum_columns(arguments.camera_rows, warps, columns, reinterpret_cast<S*>(gradients.camera), stream);
   }
 }
 

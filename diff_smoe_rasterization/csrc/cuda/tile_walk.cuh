@@ -1,7 +1,7 @@
 // The tile walk: how a warp goes through the list of a tile. Every pass over pixels is a visitor of it.
 //
-// A warp owns a square of pixels, a quarter of a tile; each lane owns two of them, one below the other, so that they
-// share a Gaussian's terms in x. (HiGS, arXiv:2606.00352, also has small squares for warps inside larger tiles.) Two
+// A warp owns a square of pixels, a quarter of a tile. Each lane owns two of them, one below the other, which share a
+// Gaussian's terms in x. (HiGS, arXiv:2606.00352, also has small squares for warps inside larger tiles.) Two
 // warps may also walk for one square; the visitor then knows which pixel of each lane is its own.
 //
 //   find    the warp looks ahead in the list for entries that may meet its pixels. In most lists entries are marked

@@ -8,8 +8,8 @@
 namespace dsmoe {
 namespace cuda {
 
-// A warp that takes up to 32 rows takes fewer where a multiprocessor would get less than this many warps: half of the
-// 64 that it can hold, enough to hide the latency of loads.
+// A warp that takes up to 32 rows takes fewer if a multiprocessor would get fewer warps than this. It is half of the 64
+// that it can hold, enough to hide the latency of loads.
 constexpr int kEnoughWarpsPerMultiprocessor = 32;
 
 // How many rows a warp takes: 32, 16, ... or `least`.
@@ -47,8 +47,8 @@ constexpr int kVisitsPerCheck = 8;
 constexpr int kBlendUnroll = 2;
 constexpr int kBlendBlocks = 6;
 
-// Two warps share a square of pixels in the forward walk where the list is longer than this, so that few long lists do
-// not decide how long the pass takes. Only so many tiles are looked at, the first ones in the order of lengths (below).
+// In the forward walk two warps share a square of pixels if the list is longer than this: a few long lists must not
+// decide how long the pass takes. Only so many tiles are looked at, the first ones in the order of lengths (below).
 // A lane then has one pixel, and registers for more visits that are interleaved.
 constexpr int kSharedFrom = 1024;
 constexpr unsigned kMostSharedTiles = 128;
@@ -109,6 +109,8 @@ constexpr int kRowsBlock = 128;
 // each thread 96 registers. With the camera's gradient, 35 more sums a thread would not fit them: the compiler decides.
 constexpr int kRowsBackwardBlocks = 5;
 constexpr int kCameraBackwardBlocks = 1;
+// With a rolling shutter 96 registers would spill some 300 bytes: 3 x 128 threads leave each thread 168.
+constexpr int kShutterBackwardBlocks = 3;
 // The same over the views of a batch, where the sums of 48 SH gradients stay in registers, but for some that spill:
 // 3 x 128 threads leave each thread 168.
 constexpr int kViewsBackwardBlocks = 3;
@@ -132,8 +134,8 @@ constexpr int kAdamMaxTensors =
 constexpr int kLossBlock = 256;  // threads: four pixels of a tile each in float, two in double
 // Neighbours that a thread computes along a window, from numbers that it reads once: 14 in place of 44.
 constexpr int kLossRun = 4;
-// The pixels of a tile. With the reach of the windows around them, the maps of a tile must fit 48 KiB of shared memory,
-// which every card gives a block; double has room for half as many.
+// The pixels of a tile. Its maps, with the reach of the windows around it, must fit the 48 KiB of shared memory that
+// every card gives a block. Double has room for half as many pixels.
 constexpr int kLossTileHeight = 32;
 template <class S> constexpr int kLossTileWidth = sizeof(S) == 4 ? 32 : 16;
 constexpr int kLossSumBlock = 512;  // threads of the one block that adds up the tiles: more of them wait less often

@@ -42,8 +42,8 @@ inline __device__ void wait_for_copies() {
 }
 
 // kLength: numbers a row, or 0 if that is only known at run time. Rows of known length are copied four numbers at a
-// time, so their array must begin at a multiple of 16 bytes. In shared memory, lanes that read the same place of their
-// rows use different banks: rows are an odd number of words apart or, if they are read as vectors, of vectors.
+// time, so their array must begin at a multiple of 16 bytes. In shared memory rows are an odd number of words apart, or
+// of vectors if they are read as such. So lanes that read the same place of their rows use different banks.
 template <int kLength> class WarpRows {
  public:
   static constexpr bool kVectors = kLength % 4 == 0 && kLength > 0;  // a row is made of vectors

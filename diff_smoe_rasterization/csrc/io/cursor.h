@@ -40,7 +40,7 @@ template <typename T> void append_little_endian(std::string& bytes, T value) {
 /// Returns text from a file as it may stand in a message: quoted, short, unprintable bytes as \xNN.
 std::string printable(std::string_view text);
 
-/// Parses the whole of `text`, in the C locale whatever the program's. False if it is no such number or out of
+/// Parses the whole of `text`, in the C locale whatever the program's. False if it is not a number or out of
 /// range.
 bool parse_number(std::string_view text, double& value);
 bool parse_whole(std::string_view text, std::uint64_t& value);

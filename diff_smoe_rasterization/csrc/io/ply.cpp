@@ -14,7 +14,14 @@ namespace dsmoe::io {
 namespace {
 
 constexpr std::string_view kBlendModeKey = "blend_mode ";
-constexpr std::string_view kBackgroundGateKey = "background_gate";
+
+/// A number that comments record: the word before it, and its name in errors.
+struct NumberInComments {
+  std::string_view key;
+  const char* name;
+};
+constexpr NumberInComments kBackgroundGate = {"background_gate", "background gate"};
+constexpr NumberInComments kFaintBelow = {"faint_below", "faint_below value"};
 
 std::size_t num_rest(int sh_degree) { return static_cast<std::size_t>(sh_coefficients(sh_degree) - 1); }
 
@@ -58,31 +65,32 @@ std::string recorded_blend_mode(const std::vector<std::string>& comments, const 
   return mode;
 }
 
-/// Returns the background gate that the comments record, if any. Throws if they record two, or what is none.
+/// Returns the number that the comments record, if any. Throws if they record two, or one that is negative or infinite.
 /// lines: the comments' line numbers, for errors; empty if they are not from a file.
-std::optional<double> recorded_background_gate(const std::vector<std::string>& comments,
-                                               const std::vector<std::size_t>& lines, const std::string& file) {
-  std::optional<double> gate;
+std::optional<double> recorded_number(NumberInComments wanted, const std::vector<std::string>& comments,
+                                      const std::vector<std::size_t>& lines, const std::string& file) {
+  const std::string name = wanted.name;
+  std::optional<double> recorded;
   for (std::size_t i = 0; i < comments.size(); ++i) {
     std::string_view text = comments[i];
-    if (text.rfind(kBackgroundGateKey, 0) != 0) continue;
-    text.remove_prefix(kBackgroundGateKey.size());
+    if (text.rfind(wanted.key, 0) != 0) continue;
+    text.remove_prefix(wanted.key.size());
     const std::size_t begin = text.find_first_not_of(" \t");
     if (begin == 0) continue;  // another word
     text.remove_prefix(std::min(begin, text.size()));
     const std::string where = file + (lines.empty() ? "" : ", line " + std::to_string(lines[i]));
     double found = 0;
     if (!parse_number(text, found) || !(found >= 0 && std::isfinite(found))) {
-      throw FormatError(where + ": the comment's background gate is " + printable(text) +
+      throw FormatError(where + ": the comment's " + name + " is " + printable(text) +
                         "; it must be a number, 0 or more and finite");
     }
-    if (gate && *gate != found) {
-      throw FormatError(where + ": the comments record two background gates, " + shortest_text(*gate) + " and " +
+    if (recorded && *recorded != found) {
+      throw FormatError(where + ": the comments record two " + name + "s, " + shortest_text(*recorded) + " and " +
                         shortest_text(found));
     }
-    gate = found;
+    recorded = found;
   }
-  return gate;
+  return recorded;
 }
 
 void check_size(const std::string& path, const char* name, std::size_t size, std::size_t expected) {
@@ -107,7 +115,8 @@ GaussianModel parse_gaussians(std::string bytes, const std::string& file) {
   model.sh_degree = sh_degree_of(vertices);
   model.comments = vertices.comments();
   model.blend_mode = recorded_blend_mode(model.comments, file);
-  model.background_gate = recorded_background_gate(model.comments, vertices.comment_lines(), file);
+  model.background_gate = recorded_number(kBackgroundGate, model.comments, vertices.comment_lines(), file);
+  model.faint_below = recorded_number(kFaintBelow, model.comments, vertices.comment_lines(), file);
 
   // f_rest is stored channel by channel, the model coefficient by coefficient.
   const std::size_t rest = num_rest(model.sh_degree);
@@ -150,9 +159,12 @@ void write_gaussians(const std::string& path, const GaussianModel& model) {
     if (std::find(comments.begin(), comments.end(), line) == comments.end()) comments.push_back(line);
   };
   if (!model.blend_mode.empty()) record(std::string(kBlendModeKey) + model.blend_mode);
-  if (model.background_gate) record(std::string(kBackgroundGateKey) + " " + shortest_text(*model.background_gate));
-  recorded_blend_mode(comments, path);  // throw if the caller's comments name another mode or gate
-  recorded_background_gate(comments, {}, path);
+  for (const auto& [wanted, number] :
+       {std::pair(kBackgroundGate, model.background_gate), std::pair(kFaintBelow, model.faint_below)}) {
+    if (number) record(std::string(wanted.key) + " " + shortest_text(*number));
+    recorded_number(wanted, comments, {}, path);  // throws if the caller's comments name another one
+  }
+  recorded_blend_mode(comments, path);
 
   std::vector<PlyColumn> columns;
   const auto add = [&](const std::string& name) { columns.push_back({name, PlyType::kFloat32}); };

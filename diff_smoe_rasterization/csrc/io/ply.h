@@ -31,6 +31,7 @@ struct GaussianModel {
   std::vector<float> rotations;            // [N, 4] (w, x, y, z), not normalised
   std::string blend_mode;                  // what "comment blend_mode NAME" records, or empty
   std::optional<double> background_gate;   // what "comment background_gate VALUE" records, likewise
+  std::optional<double> faint_below;       // likewise; a file has it where it is not the blend mode's usual one
   std::vector<std::string> comments = {};  // all comment lines, these included
 };
 
@@ -41,9 +42,9 @@ GaussianModel read_gaussians(const std::string& path);
 /// The same from the bytes of a file, which `file` names in errors.
 GaussianModel parse_gaussians(std::string bytes, const std::string& file);
 
-/// Writes binary little endian float32 columns in Inria's order, normals zero. Blend mode and background gate become
-/// comment lines; the gate is read back as the same double. Throws FileError; FormatError if a vector has not the
-/// size that count and sh_degree ask for, and if the comments record something else.
+/// Writes binary little endian float32 columns in Inria's order, normals zero. Blend mode, background gate and
+/// faint_below become comment lines; numbers are read back as the same doubles. Throws FileError; FormatError if a
+/// vector has not the size that count and sh_degree ask for, and if the comments record something else.
 void write_gaussians(const std::string& path, const GaussianModel& model);
 
 /// Reads x y z and, if present, red green blue (whole numbers 0 to 255) and nx ny nz.

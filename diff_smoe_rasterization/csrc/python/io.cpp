@@ -127,6 +127,7 @@ void write_gaussians_python(const std::string& path, int sh_degree, const Array<
                             to_vector(rotations),
                             blend_mode,
                             background_gate,
+                            std::nullopt,  // which the comments record
                             comments};
   const Unlocked unlocked;
   write_gaussians(path, model);

@@ -58,7 +58,7 @@ py::dict options() {
   return types;
 }
 
-// What a backend saves: of each tensor its name, its type ("real": that of the inputs) and how many numbers a row has.
+// What a backend saves: of each tensor its name, its type ("real": the inputs' type) and how many numbers a row has.
 template <class Saved, class Sizes> py::list saved_arrays() {
   py::list arrays;
   Saved saved;
@@ -134,6 +134,8 @@ PYBIND11_MODULE(_core, module) {
   module.attr("blend_modes") = blend_modes();
   module.attr("camera_models") =
       py::tuple(py::cast(std::vector<std::string>(std::begin(kLensNames), std::end(kLensNames))));
+  module.attr("rolling_shutters") =
+      py::tuple(py::cast(std::vector<std::string>(std::begin(kShutterNames), std::end(kShutterNames))));
   module.attr("inputs") = inputs();
   module.attr("images") = images();
   module.attr("options") = options();

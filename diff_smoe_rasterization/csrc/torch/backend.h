@@ -2,8 +2,17 @@
 // the backend's types, and its functions with arguments of one form.
 #pragma once
 
+#include "dsmoe/rasterize_cuda.h"
 #include "op.h"
 #include "process.h"
+
+// Calls a pass over the pixels of a rendering (dsmoe/passes), which both backends have, on a Backend.
+#define DSMOE_WALK(Backend, pass, frame, map, options, memory) \
+  if constexpr (Backend::kOnHost) {                            \
+    cpu::pass(frame, map);                                     \
+  } else {                                                     \
+    cuda::pass(frame, map, Backend::work(options, memory));    \
+  }
 
 namespace dsmoe {
 namespace binding {
@@ -25,6 +34,7 @@ template <class Core> struct Backend : Core {
     fill_frame<S>(frame, inputs, options);
     Core::set_camera(frame.camera, data<S>(inputs[kViewMatrix]), data<S>(inputs[kProjMatrix]),
                      data<S>(inputs[kCampos]));
+    Core::set_view_end(frame.camera, data<S>(inputs[kViewMatrixEnd]));
     Core::set_threads(frame.config);
     frame.images = image_outputs<S>(images);
     return frame;
@@ -150,8 +160,9 @@ template <class Core> struct Backend : Core {
     return own;
   }
 
-  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near,
-                        int64_t camera_model) {
+  // view_end: undefined if the shutter does not roll.
+  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, const Tensor& view_end,
+                        double near, int64_t camera_model) {
     const Tensor visible = empty({positions.size(0)}, positions, kBool);
     dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
@@ -159,6 +170,8 @@ template <class Core> struct Backend : Core {
       frame.inputs.num_gaussians = positions.size(0);
       frame.inputs.means3D = positions.data_ptr<S>();
       Core::set_view(frame.camera, view.data_ptr<S>());
+      Core::set_view_end(frame.camera, data<S>(view_end));
+      if (view_end.defined()) frame.camera.shutter = Shutter::kTopToBottom;
       frame.camera.near = static_cast<float>(near);
       frame.camera.lens.model = static_cast<LensModel>(camera_model);
       Core::mark_visible(frame, visible.data_ptr<bool>());

@@ -143,6 +143,10 @@ Expect check_arguments(const char* function, const Inputs& inputs, const Options
       expect(kInputNames[i], inputs[i], input_shape(i, inputs));
     }
   }
+  const bool has_end = inputs[kViewMatrixEnd].defined();
+  DSMOE_CHECK_VALUE(has_end == (options.rolling_shutter != 0), function, ": viewmatrix_end is ",
+                    has_end ? "given" : "absent", ", but rolling_shutter is ", options.rolling_shutter,
+                    has_end ? "; it must be absent" : "; it must be given");
   if (num_gaussians(inputs) == 0) {  // then the core cannot know which of the arrays are given
     const int channels = static_cast<int>(num_channels(inputs));
     as_op(function, [&] { refuse_given(function, gaussian_inputs<float>(inputs, options), channels); });

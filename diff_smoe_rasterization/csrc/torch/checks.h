@@ -43,8 +43,8 @@ int64_t first_set(const Tensor& flags);
 
 constexpr ScalarType kAsLike = ScalarType::Undefined;
 
-// What holds for all tensors of one call of an op: they are of the type and on the device of one of them, `like`, and
-// none carries a tangent, which the ops would drop (NotImplementedError).
+// Checks of the tensors of one call of an op. All are of the type and on the device of one of them, `like`. None
+// carries a tangent, which the ops would drop (NotImplementedError).
 class Expect {
  public:
   // function: the op that errors name. like: float32 or float64; like_name: its name.

@@ -4,22 +4,23 @@
 #pragma once
 
 // The tensors: X(enumerator, type in the schema, name, shape...). N Gaussians, C channels: 3 with shs.
-#define DSMOE_INPUTS(X)                                                                                       \
-  X(kMeans3D, "Tensor", means3D, "N", 3)                                                                      \
-  X(kMeans2D, "Tensor?", means2D, "N", 3)    /* only its gradient is of use */                                \
-  X(kOpacities, "Tensor", opacities, "N", 1) /* or [N] */                                                     \
-  X(kDc, "Tensor?", dc, "N", 1, 3)                                                                            \
-  X(kShs, "Tensor?", shs, "N", "K", 3)                                                                        \
-  X(kColorsPrecomp, "Tensor?", colors_precomp, "N", "C")                                                      \
-  X(kScales, "Tensor?", scales, "N", 3)                                                                       \
-  X(kRotations, "Tensor?", rotations, "N", 4)                                                                 \
-  X(kCov3DPrecomp, "Tensor?", cov3D_precomp, "N", 6)                                                          \
-  X(kBackground, "Tensor", bg, "C")                                                                           \
-  X(kViewMatrix, "Tensor", viewmatrix, 4, 4)                                                                  \
-  X(kProjMatrix, "Tensor", projmatrix, 4, 4)                                                                  \
-  X(kCampos, "Tensor", campos, 3)                                                                             \
-  X(kBackgroundGate, "Tensor?", background_gate, 1) /* in any number of dimensions; absent: a fixed number */ \
-  X(kMeans2DAbs, "Tensor?", means2D_abs, "N", 2)    /* only its gradient is of use */
+#define DSMOE_INPUTS(X)                                                                                        \
+  X(kMeans3D, "Tensor", means3D, "N", 3)                                                                       \
+  X(kMeans2D, "Tensor?", means2D, "N", 3)    /* only its gradient is of use */                                 \
+  X(kOpacities, "Tensor", opacities, "N", 1) /* or [N] */                                                      \
+  X(kDc, "Tensor?", dc, "N", 1, 3)                                                                             \
+  X(kShs, "Tensor?", shs, "N", "K", 3)                                                                         \
+  X(kColorsPrecomp, "Tensor?", colors_precomp, "N", "C")                                                       \
+  X(kScales, "Tensor?", scales, "N", 3)                                                                        \
+  X(kRotations, "Tensor?", rotations, "N", 4)                                                                  \
+  X(kCov3DPrecomp, "Tensor?", cov3D_precomp, "N", 6)                                                           \
+  X(kBackground, "Tensor", bg, "C")                                                                            \
+  X(kViewMatrix, "Tensor", viewmatrix, 4, 4)                                                                   \
+  X(kProjMatrix, "Tensor", projmatrix, 4, 4)                                                                   \
+  X(kCampos, "Tensor", campos, 3)                                                                              \
+  X(kViewMatrixEnd, "Tensor?", viewmatrix_end, 4, 4) /* absent: the shutter does not roll */                   \
+  X(kBackgroundGate, "Tensor?", background_gate, 1)  /* in any number of dimensions; absent: a fixed number */ \
+  X(kMeans2DAbs, "Tensor?", means2D_abs, "N", 2)     /* only its gradient is of use */
 
 // The others: X(type in C++, type in the schema, name). They mean what the field of that name means in settings.py.
 // for_backward stays the last one: callers in Python append it.
@@ -38,6 +39,7 @@
   X(int64_t, "int", blend_mode)           /* its number */                                          \
   X(int64_t, "int", camera_model)         /* its number */                                          \
   X(std::vector<double>, "float[]", lens) /* principal point and distortion; empty for a pinhole */ \
+  X(int64_t, "int", rolling_shutter)      /* its number */                                          \
   X(bool, "bool", antialiasing)                                                                     \
   X(bool, "bool", depth)         /* whether that image is wanted */                                 \
   X(bool, "bool", inverse_depth) /* whether that image is wanted */                                 \

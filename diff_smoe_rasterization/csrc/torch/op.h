@@ -86,7 +86,8 @@ template <class Backend> Inputs checked(const char* function, const Inputs& inpu
   if (options.strict) refuse_non_finite(function, dense);
   if (options.prefiltered) {
     refuse_culled(function, dense,
-                  Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], options.near, options.camera_model));
+                  Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], dense[kViewMatrixEnd], options.near,
+                                   options.camera_model));
   }
   return dense;
 }

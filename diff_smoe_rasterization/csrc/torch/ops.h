@@ -296,13 +296,19 @@ template <class Backend> void project_backward(Arguments& arguments) {
   arguments.give_back(std::move(results));
 }
 
-template <class Backend>
-Tensor mark_visible(const Tensor& positions, const Tensor& viewmatrix, double near, int64_t camera_model) {
+template <class Backend> void mark_visible(Arguments& arguments) {
+  const auto positions = arguments.read<Tensor>(), viewmatrix = arguments.read<Tensor>();
+  const auto near = arguments.read<double>();
+  const auto camera_model = arguments.read<int64_t>();
+  Tensor viewmatrix_end = read_optional(arguments);
   const Expect expect("markVisible", "positions", positions);
   expect("positions", positions, {"N", 3});
   expect("viewmatrix", viewmatrix, {4, 4});
+  if (viewmatrix_end.defined()) expect("viewmatrix_end", viewmatrix_end, {4, 4});
   const typename Backend::Guard guard(positions.device());
-  return Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), near, camera_model);
+  if (viewmatrix_end.defined()) viewmatrix_end = viewmatrix_end.contiguous();
+  arguments.give_back(Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), viewmatrix_end,
+                                       near, camera_model));
 }
 
 template <class Backend> void register_ops(Library& m) {
@@ -314,7 +320,7 @@ template <class Backend> void register_ops(Library& m) {
   implement<&blend<Backend>>(m, "blend");
   implement<&blend_backward<Backend>>(m, "blend_backward");
   implement<&radii<Backend>>(m, "radii");
-  implement<&with_arguments<&mark_visible<Backend>>>(m, "mark_visible");
+  implement<&mark_visible<Backend>>(m, "mark_visible");
 }
 
 }  // namespace binding

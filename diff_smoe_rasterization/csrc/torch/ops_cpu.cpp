@@ -22,6 +22,9 @@ struct CpuCore {
   static int64_t feature_columns(int64_t num_features) { return num_features; }
   template <class Config> static void set_threads(Config& config) { config.num_threads = num_threads(); }
   template <class S> static void set_view(Camera<S>& camera, const S* view) { std::copy_n(view, 16, camera.view); }
+  template <class S> static void set_view_end(Camera<S>& camera, const S* view) {
+    if (view != nullptr) std::copy_n(view, 16, camera.view_end);
+  }
   template <class S> static void set_camera(Camera<S>& camera, const S* view, const S* projection, const S* position) {
     set_view(camera, view);
     std::copy_n(projection, 16, camera.projection);
@@ -66,16 +69,6 @@ struct CpuCore {
   }
   template <class Frame> static void mark_visible(const Frame& frame, bool* visible) {
     cpu::mark_visible(frame, visible);
-  }
-
-  template <class Frame, class Map> static void contributions(const Frame& frame, const Map& map, const Call&) {
-    cpu::contributions(frame, map);
-  }
-  template <class Frame, class Map> static void importance(const Frame& frame, const Map& map, const Call&) {
-    cpu::importance(frame, map);
-  }
-  template <class Frame, class Map> static void gate_map(const Frame& frame, const Map& map, const Call&) {
-    cpu::gate_map(frame, map);
   }
 
   static void count_rows(const ViewBatch& batch) { cpu::count_rows(batch); }

@@ -46,6 +46,7 @@ struct CudaCore {
   static int64_t feature_columns(int64_t num_features) { return cuda::feature_stride(static_cast<int>(num_features)); }
   template <class Config> static void set_threads(Config&) {}
   template <class Camera, class S> static void set_view(Camera& camera, const S* view) { camera.view = view; }
+  template <class Camera, class S> static void set_view_end(Camera& camera, const S* view) { camera.view_end = view; }
   template <class Camera, class S>
   static void set_camera(Camera& camera, const S* view, const S* projection, const S* position) {
     camera.view = view, camera.projection = projection, camera.position = position;
@@ -61,8 +62,8 @@ struct CudaCore {
   }
   static cuda::Run run(const Call& call) { return run(call.options, call.times); }
 
-  static cuda::Work work(const Call& call) {
-    return {current_stream(), &call.memory, nullptr, call.options.deterministic};
+  static cuda::Work work(const Options& options, Allocator& memory) {
+    return {current_stream(), &memory, nullptr, options.deterministic};
   }
 
   template <class Frame> static cuda::SavedSizes saved_sizes(const Frame& frame, const Options& options) {
@@ -108,16 +109,6 @@ struct CudaCore {
   }
   template <class Frame> static void mark_visible(const Frame& frame, bool* visible) {
     cuda::mark_visible(frame, visible, {current_stream()});
-  }
-
-  template <class Frame, class Map> static void contributions(const Frame& frame, const Map& map, const Call& call) {
-    cuda::contributions(frame, map, work(call));
-  }
-  template <class Frame, class Map> static void importance(const Frame& frame, const Map& map, const Call& call) {
-    cuda::importance(frame, map, work(call));
-  }
-  template <class Frame, class Map> static void gate_map(const Frame& frame, const Map& map, const Call& call) {
-    cuda::gate_map(frame, map, work(call));
   }
 
   static void count_rows(const ViewBatch& batch) { cuda::count_rows(batch, {current_stream()}); }

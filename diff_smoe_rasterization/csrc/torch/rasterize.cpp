@@ -28,13 +28,14 @@ struct Given : GaussianRasterizationSettings {
   int64_t blend_mode = 0;
   double fixed_background_gate = 0, faint_below = 0;
   at::Tensor background_gate;
-  int64_t camera_model = 0;
+  int64_t camera_model = 0, rolling_shutter = 0;
   std::vector<double> lens;
   bool depth = false, inverse_depth = false, for_backward = false;
 
  private:
   void resolve_blend();
   void resolve_lens();
+  void resolve_shutter();
 };
 
 // For messages alone.
@@ -99,6 +100,12 @@ void Given::resolve_lens() {
     names += (model == 0 ? "" : ", ") + std::string(kLensNames[model]);
   }
   TORCH_CHECK_VALUE(camera_model >= 0, "rasterize: camera_model is '", name, "'; it must be one of ", names);
+  resolve_shutter();
+  if (camera_model == 0 && rolling_shutter != 0 && distortion.empty()) {
+    TORCH_CHECK_VALUE(principal_point, "rasterize: principal_point is absent, but rolling_shutter is '",
+                      Settings::rolling_shutter, "', with which projmatrix is not read; it must be given");
+    camera_model = static_cast<int64_t>(LensModel::kOpencv);
+  }
   if (camera_model == 0) {
     TORCH_CHECK_VALUE(distortion.empty() && !principal_point,
                       "rasterize: ", distortion.empty() ? "principal_point" : "distortion",
@@ -111,15 +118,27 @@ void Given::resolve_lens() {
   lens.insert(lens.end(), distortion.begin(), distortion.end());
 }
 
+void Given::resolve_shutter() {
+  const std::string& name = Settings::rolling_shutter;
+  std::string names;
+  rolling_shutter = -1;
+  for (int shutter = 0; shutter < kNumShutters; ++shutter) {
+    if (name == kShutterNames[shutter]) rolling_shutter = shutter;
+    names += (shutter == 0 ? "" : ", ") + std::string(kShutterNames[shutter]);
+  }
+  TORCH_CHECK_VALUE(rolling_shutter >= 0, "rasterize: rolling_shutter is '", name, "'; it must be one of ", names);
+}
+
 // The op's tensors in their order; absent ones are undefined.
 Inputs gather(const at::Tensor& means3D, const at::Tensor& opacities, const Given& given,
               const RasterizeArguments& arguments) {
   struct : RasterizeArguments {
-    at::Tensor means3D, opacities, bg, viewmatrix, projmatrix, campos, background_gate;
+    at::Tensor means3D, opacities, bg, viewmatrix, projmatrix, campos, viewmatrix_end, background_gate;
   } all;
   static_cast<RasterizeArguments&>(all) = arguments;
   all.means3D = means3D, all.opacities = opacities, all.bg = given.bg, all.viewmatrix = given.viewmatrix;
-  all.projmatrix = given.projmatrix, all.campos = given.campos, all.background_gate = given.background_gate;
+  all.viewmatrix_end = given.viewmatrix_end, all.projmatrix = given.projmatrix, all.campos = given.campos,
+  all.background_gate = given.background_gate;
   Inputs inputs;
   const auto add = [&](int index, std::string_view schema, const at::Tensor& tensor) {
     const bool may_be_absent = schema == "Tensor?" && tensor.defined() && tensor.numel() == 0;

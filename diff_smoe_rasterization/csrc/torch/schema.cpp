@@ -75,5 +75,7 @@ DSMOE_LIBRARY(m) {
   m.def(kProjectBackward.c_str());
   m.def(kBlend.c_str());
   m.def(kBlendBackward.c_str());
-  m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near, int camera_model=0) -> Tensor");
+  m.def(
+      "mark_visible(Tensor positions, Tensor viewmatrix, float near, int camera_model=0, Tensor? viewmatrix_end=None) "
+      "-> Tensor");
 }

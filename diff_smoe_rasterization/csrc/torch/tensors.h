@@ -241,7 +241,7 @@ template <class S> GaussianGradients<S> gaussian_gradients(const Inputs& gradien
 }
 
 // Numbers of a view in the ops on batches, whose last ones are those of its lens.
-constexpr int kMostLensNumbers = 2 + kMostDistortion, kNumbersOfImage = 6 + kMostLensNumbers;
+constexpr int kMostLensNumbers = 2 + kMostDistortion, kNumbersOfImage = 7 + kMostLensNumbers;
 
 // The lens of the options, whose focal lengths are in the tangents, as those of a pinhole are.
 template <class S> Lens<S> lens_of(const Options& options) {
@@ -266,6 +266,7 @@ template <class S, class Frame> void fill_frame(Frame& frame, const Inputs& inpu
   frame.config = raster_config<S>(inputs, options);
   set_image(frame.camera, options);
   frame.camera.lens = lens_of<S>(options);
+  frame.camera.shutter = static_cast<Shutter>(to_int(options.rolling_shutter));
 }
 
 // A gradient that the core returns in one piece, and the inputs whose gradients are its parts, in their order.
@@ -301,7 +302,8 @@ template <class S, class Gradients, class Backward>
 void with_input_gradients(const Inputs& inputs, const Inputs& gradients, bool seen_only, Gradients& out,
                           Backward backward) {
   const Tensor& like = inputs[kMeans3D];
-  const JointGradient camera({{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}}, gradients, like);
+  const JointGradient camera({{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}, {kViewMatrixEnd, 16}}, gradients,
+                             like);
   const JointGradient background({{kBackground, num_channels(inputs)}, {kBackgroundGate, 1}}, gradients, like);
   out.inputs = gaussian_gradients<S>(gradients);
   out.inputs.camera = reinterpret_cast<CameraGradient<S>*>(mutable_data<S>(camera.whole));

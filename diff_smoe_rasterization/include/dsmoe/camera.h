@@ -20,8 +20,20 @@ template <class S> struct PinholeCamera {
   S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
 
-// With a lens that is no pinhole, neither the tangents nor `projection` are read: all of the pose is in `view`.
-template <class S> struct Camera : PinholeCamera<S> { Lens<S> lens; };
+// With a lens other than a pinhole, neither the tangents nor `projection` are read: all of the pose is in `view`.
+template <class S> struct LensCamera : PinholeCamera<S> { Lens<S> lens; };
+
+// How an image is read out: at once, or by rows or columns in this order.
+enum class Shutter : int { kGlobal, kTopToBottom, kLeftToRight, kBottomToTop, kRightToLeft };
+constexpr const char* kShutterNames[] = {"global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left"};
+constexpr int kNumShutters = sizeof(kShutterNames) / sizeof(kShutterNames[0]);
+
+// With a rolling shutter `view` is the pose at the first row, or column, and the lens is not a pinhole: one without
+// distortion is kOpencv.
+template <class S> struct Camera : LensCamera<S> {
+  Shutter shutter = Shutter::kGlobal;
+  S view_end[16] = {};  // [4, 4] the pose at the last row. Only read with a rolling shutter
+};
 
 // A calibrated pinhole camera. View axes are x right, y down, z forward. The centre of the top left pixel is
 // (0.5, 0.5), as in COLMAP.
@@ -73,33 +85,45 @@ template <class S> struct CameraShare {
   Mat3<S> dL_drotation;  // by the rotation part of the view matrix
   Vec3<S> dL_dclip;      // by x, y and w of the point in clip space
   Vec3<S> dL_dposition;
+  Vec3<S> dL_dview_end;  // the same two by the pose at the end of a rolling shutter
+  Mat3<S> dL_drotation_end;
 };
 
 template <class S> struct CameraGradient {
   S view[16] = {};
   S projection[16] = {};
   S position[3] = {};
+  S view_end[16] = {};  // on a device only written with a rolling shutter
 
   DSMOE_HD void add(const CameraShare<S>& share) {
     const S point[4] = {share.point.x, share.point.y, share.point.z, S(1)};
     for (int i = 0; i < 4; ++i) {
-      view[4 * i + 0] += point[i] * share.dL_dview.x;
-      view[4 * i + 1] += point[i] * share.dL_dview.y;
-      view[4 * i + 2] += point[i] * share.dL_dview.z;
       projection[4 * i + 0] += point[i] * share.dL_dclip.x;
       projection[4 * i + 1] += point[i] * share.dL_dclip.y;
       projection[4 * i + 3] += point[i] * share.dL_dclip.z;
     }
-    const auto& [x, y, z] = share.dL_drotation;
-    view[0] += x.x, view[4] += x.y, view[8] += x.z;
-    view[1] += y.x, view[5] += y.y, view[9] += y.z;
-    view[2] += z.x, view[6] += z.y, view[10] += z.z;
+    add_pose(view, point, share.dL_dview, share.dL_drotation);
+    add_pose(view_end, point, share.dL_dview_end, share.dL_drotation_end);
     position[0] += share.dL_dposition.x, position[1] += share.dL_dposition.y, position[2] += share.dL_dposition.z;
   }
 
   DSMOE_HD void add(const CameraGradient& other) {
     for (int k = 0; k < 16; ++k) view[k] += other.view[k], projection[k] += other.projection[k];
+    for (int k = 0; k < 16; ++k) view_end[k] += other.view_end[k];
     for (int k = 0; k < 3; ++k) position[k] += other.position[k];
+  }
+
+ private:
+  DSMOE_HD static void add_pose(S* to, const S* point, Vec3<S> dL_dview, const Mat3<S>& dL_drotation) {
+    for (int i = 0; i < 4; ++i) {
+      to[4 * i + 0] += point[i] * dL_dview.x;
+      to[4 * i + 1] += point[i] * dL_dview.y;
+      to[4 * i + 2] += point[i] * dL_dview.z;
+    }
+    const auto& [x, y, z] = dL_drotation;
+    to[0] += x.x, to[4] += x.y, to[8] += x.z;
+    to[1] += y.x, to[5] += y.y, to[9] += y.z;
+    to[2] += z.x, to[6] += z.y, to[10] += z.z;
   }
 };
 

@@ -295,6 +295,23 @@ DSMOE_HD Vec3<S> through_lens_backward(const Lens<S>& lens, Vec3<S> view, Vec2<S
   return plane_point_backward(lens, view, g);
 }
 
+// A pixel along an axis of the image, and its gradient by the point in view space: of the pixel itself, also where the
+// Jacobian above is taken at another slope.
+template <class S> struct AlongAxis {
+  S at;
+  Vec3<S> gradient;
+};
+
+template <class S> DSMOE_HD AlongAxis<S> along_axis(const Lens<S>& lens, Vec3<S> view, Vec2<S> axis) {
+  const auto plane = plane_point(lens, view);
+  Mat23<S> j = plane.jacobian;
+  if (lens.model == LensModel::kOpencv) j.r0.z = -j.r0.x * plane.at.x, j.r1.z = -j.r1.y * plane.at.y;
+  const auto to = distort(lens.distortion, plane.at);
+  const S u = axis.x * lens.focal.x, v = axis.y * lens.focal.y;
+  return {u * to.at.x + v * to.at.y + axis.x * lens.principal.x + axis.y * lens.principal.y,
+          (u * to.row_u.x + v * to.row_v.x) * j.r0 + (u * to.row_u.y + v * to.row_v.y) * j.r1};
+}
+
 // What a calibration says of a lens.
 struct LensCalibration {
   LensModel model = LensModel::kPinhole;
@@ -376,7 +393,7 @@ inline double range_of(const Distortion<double>& d, double end, bool slopes) {
   return end;
 }
 
-// The undistorted radius over the distorted one, where that is r; at most that of the range.
+// The undistorted radius over the distorted one, r. The undistorted one is at most `range`.
 inline double stretch(const Distortion<double>& d, double range, double r) {
   double low = 0, high = range;
   for (int step = 0; step < 80; ++step) {

@@ -1,7 +1,7 @@
 // What goes in and out of the rasterizer, as plain structs of pointers. Every array is dense and row-major; N is the
 // number of Gaussians, F the number of features (colour channels, then z and 1/z on request), I of tile instances.
 //
-// A pointer may be null if its comment or that of its struct says so, and if its array has no elements. No other
+// A pointer may be null if its comment or its struct's says so, and if its array has no elements. No other
 // may: the passes of rasterize.h and rasterize_cuda.h refuse it.
 #pragma once
 
@@ -148,20 +148,6 @@ template <class S> struct ImageOutputs {
   S* gate_sum = nullptr;       // [H, W] the alpha image: W, or W / D in a mode with tails
 };
 
-// Sums over the pixels that blended a Gaussian, as passes/contributions.h says; written whole.
-template <class S> struct ContributionSums {
-  S* pixel_weights = nullptr;  // [N]
-  int32_t* pixels = nullptr;   // [N]
-  S* blend_weights = nullptr;  // [N]
-  S* distances = nullptr;      // [N] pixels
-};
-
-// From a map of the image to sums over the pixels of each Gaussian.
-template <class S> struct ContributionMap {
-  const S* pixel_weights = nullptr;  // [H, W]
-  ContributionSums<S> sums;
-};
-
 // Sums over the pixels of each Gaussian, as removal.h says; written whole.
 template <class S> struct ImportanceSums {
   S* shares = nullptr;          // [N]
@@ -175,15 +161,6 @@ template <class S> struct ImportanceMap {
   const S* pixel_weights = nullptr;  // [H, W] of squared shares and removal costs
   const S* share_weights = nullptr;  // [H, W] of shares
   ImportanceSums<S> sums;
-};
-
-// Per pixel; all are written whole.
-struct GateMap {
-  int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 if none is
-  int32_t* counts = nullptr;     // [H, W] how many Gaussians the numerator has
-  // [H, W] the one with which the weights, in the order of the list, reach half of the denominator; -1 where none does.
-  // Or null
-  int32_t* medians = nullptr;
 };
 
 // Any of these may be null. Then that output was not used.
@@ -217,7 +194,7 @@ template <class S> struct GaussianGradients {
 constexpr int kNumGateGradients = 6;  // by the centre's x and y, the conic's xx, xy and yy, and the opacity
 template <class S> struct FootprintGradients {
   S* records = nullptr;       // [N, kNumGateGradients + F] those of the gate, then by the features
-  const S* depths = nullptr;  // [N] by the view depth, added to that of the features; or null. No blend writes it.
+  const S* depths = nullptr;  // [N] by the view depth, added to the features' gradient; or null. No blend writes it.
 };
 
 // One rendering, from its inputs to what it leaves for the backward pass. The backends differ in where the camera lies

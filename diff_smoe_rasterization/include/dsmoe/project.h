@@ -7,6 +7,7 @@
 #include "dsmoe/blend.h"
 #include "dsmoe/camera.h"
 #include "dsmoe/covariance.h"
+#include "dsmoe/shutter.h"
 #include "dsmoe/tiles.h"
 
 namespace dsmoe {
@@ -80,11 +81,35 @@ template <class S> struct ViewGradient {
   PixelGradient<S> pixel;
 };
 
-// The two ways from view space to the image. By the camera's matrix:
+// What comes back to a Gaussian's mean and to the camera by way of the pose.
+template <class S> struct PoseGradient {
+  Vec3<S> mean;
+  CameraShare<S> camera;
+};
+
+template <class S>
+DSMOE_HD PoseGradient<S> pose_backward(const PinholeCamera<S>& camera, Vec3<S> mean, const ViewGradient<S>& by,
+                                       const Mat3<S>& dL_drotation) {
+  PoseGradient<S> out = {};
+  out.mean = transform_point_backward(camera.view, by.view) + by.pixel.point;
+  out.camera.point = mean, out.camera.dL_dview = by.view, out.camera.dL_drotation = dL_drotation;
+  out.camera.dL_dclip = by.pixel.clip;
+  return out;
+}
+
+// J^T dL_daxes, where all of J counts.
+template <class S> DSMOE_HD Mat3<S> rotation_backward(const Mat23<S>& j, const Mat23<S>& dL_daxes) {
+  return {j.r0.x * dL_daxes.r0 + j.r1.x * dL_daxes.r1, j.r0.y * dL_daxes.r0 + j.r1.y * dL_daxes.r1,
+          j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1};
+}
+
+// The three ways to the image. By the camera's matrix:
 template <class S> struct ByMatrix {
   using Point = ProjectionJacobian<S>;
   const PinholeCamera<S>& camera;
 
+  DSMOE_HD Vec3<S> to_view(Vec3<S> mean) const { return transform_point(camera.view, mean); }
+  DSMOE_HD Mat3<S> rotation() const { return view_rotation(camera.view); }
   DSMOE_HD S depth(Vec3<S> view) const { return view.z; }
   DSMOE_HD Point point(Vec3<S> view) const { return projection_jacobian(camera, view); }
   DSMOE_HD bool sees(const Point&) const { return true; }
@@ -100,17 +125,21 @@ template <class S> struct ByMatrix {
     return out;
   }
 
-  // J^T dL_daxes
-  DSMOE_HD Mat3<S> rotation_backward(const Mat23<S>& j, const Mat23<S>& dL_daxes) const {
-    return {j.r0.x * dL_daxes.r0, j.r1.y * dL_daxes.r1, j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1};
+  DSMOE_HD PoseGradient<S> pose_backward(Vec3<S> mean, const Point& point, const ViewGradient<S>& by,
+                                         const Mat23<S>& dL_daxes) const {
+    const Mat23<S>& j = point.jacobian;
+    return dsmoe::pose_backward(
+        camera, mean, by, {j.r0.x * dL_daxes.r0, j.r1.y * dL_daxes.r1, j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1});
   }
 };
 
-// Through its lens, which is no pinhole. All of the pose comes from the view matrix.
+// Through a lens other than a pinhole. All of the pose comes from the view matrix.
 template <class S> struct ByLens {
   using Point = LensPoint<S>;
-  const Camera<S>& camera;
+  const LensCamera<S>& camera;
 
+  DSMOE_HD Vec3<S> to_view(Vec3<S> mean) const { return transform_point(camera.view, mean); }
+  DSMOE_HD Mat3<S> rotation() const { return view_rotation(camera.view); }
   DSMOE_HD S depth(Vec3<S> view) const { return view_depth(camera.lens.model, view); }
   DSMOE_HD Point point(Vec3<S> view) const { return through_lens(camera.lens, view); }
   DSMOE_HD bool sees(const Point& point) const { return point.seen; }
@@ -125,9 +154,52 @@ template <class S> struct ByLens {
             {}};
   }
 
-  DSMOE_HD Mat3<S> rotation_backward(const Mat23<S>& j, const Mat23<S>& dL_daxes) const {
-    return {j.r0.x * dL_daxes.r0 + j.r1.x * dL_daxes.r1, j.r0.y * dL_daxes.r0 + j.r1.y * dL_daxes.r1,
-            j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1};
+  DSMOE_HD PoseGradient<S> pose_backward(Vec3<S> mean, const Point& point, const ViewGradient<S>& by,
+                                         const Mat23<S>& dL_daxes) const {
+    return dsmoe::pose_backward(camera, mean, by, rotation_backward(point.jacobian, dL_daxes));
+  }
+};
+
+// Through its lens by the pose of the time at which the shutter reads the Gaussian's mean.
+template <class S> struct ByShutter {
+  using Point = ShutterPoint<S>;
+  const Camera<S>& camera;
+  Readout<S> readout;
+  ShutterTime<S> moment;
+
+  DSMOE_HD ByShutter(const Camera<S>& camera, Vec3<S> mean)
+      : camera(camera), readout(camera), moment(shutter_time(camera, readout, mean)) {}
+
+  DSMOE_HD Vec3<S> to_view(Vec3<S>) const { return moment.view; }
+  DSMOE_HD Mat3<S> rotation() const {
+    return between(view_rotation(camera.view), view_rotation(camera.view_end), moment.time);
+  }
+  DSMOE_HD S depth(Vec3<S> view) const { return view_depth(camera.lens.model, view); }
+  DSMOE_HD Point point(Vec3<S>) const { return through_shutter(camera.lens, readout, moment); }
+  DSMOE_HD bool sees(const Point& point) const { return point.seen; }
+  DSMOE_HD Vec2<S> pixel(Vec3<S>, const Point& point) const { return point.pixel; }
+
+  // At a fixed time; `pose_backward` adds what comes by way of the time.
+  DSMOE_HD MovingGradient<S> backward(Vec3<S>, Vec3<S> view, const Point& point, const Mat23<S>& dL_dJ,
+                                      const ProjectedGradient<S>& g, bool inverse_depth) const {
+    S dL_ddepth = g.depth;
+    if (inverse_depth) dL_ddepth -= g.inverse_depth / (depth(view) * depth(view));
+    auto out = through_shutter_backward(camera.lens, readout, moment, point, g.gate.mean, dL_dJ);
+    out.view = out.view + view_depth_backward(camera.lens.model, view, dL_ddepth);
+    return out;
+  }
+
+  DSMOE_HD PoseGradient<S> pose_backward(Vec3<S> mean, const Point& point, const MovingGradient<S>& by,
+                                         const Mat23<S>& dL_daxes) const {
+    const Mat3<S> dL_drotation = rotation_backward(point.jacobian, dL_daxes);
+    const auto [start, end] = shutter_time_backward(camera, readout, moment, by, dL_drotation);
+    const S time = moment.time;
+    PoseGradient<S> out = {};
+    out.mean = transform_point_backward(camera.view, start) + transform_point_backward(camera.view_end, end);
+    out.camera.point = mean;
+    out.camera.dL_dview = start, out.camera.dL_drotation = (S(1) - time) * dL_drotation;
+    out.camera.dL_dview_end = end, out.camera.dL_drotation_end = time * dL_drotation;
+    return out;
   }
 };
 
@@ -147,7 +219,7 @@ DSMOE_HD Covariances<S, typename Way::Point> covariances(const Gaussian<S>& gaus
                                                          const ProjectionRules<S>& rules) {
   Covariances<S, typename Way::Point> out = {};
   out.point = way.point(view);
-  out.axes = image_axes(out.point.jacobian, view_rotation(way.camera.view));
+  out.axes = image_axes(out.point.jacobian, way.rotation());
   if (gaussian.has_covariance) {
     out.image = covariance_2d(out.axes, gaussian.covariance);
     out.conic = make_conic(out.image, rules.low_pass);
@@ -166,7 +238,7 @@ DSMOE_HD Projection<S> project_by(const Way& way, const Gaussian<S>& gaussian, c
   const PinholeCamera<S>& camera = way.camera;
   Projection<S> out;
   out.radius = 0;
-  const Vec3<S> view = transform_point(camera.view, gaussian.mean);
+  const Vec3<S> view = way.to_view(gaussian.mean);
   const S depth = way.depth(view);
   if (!(depth > camera.near) || !in_range(gaussian.opacity)) return out;
   const auto made = covariances(gaussian, way, view, rules);
@@ -198,9 +270,16 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const PinholeCamera<
 }
 
 template <class S>
-DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& camera, const ProjectionRules<S>& rules) {
+DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const LensCamera<S>& camera,
+                               const ProjectionRules<S>& rules) {
   if (camera.lens.model == LensModel::kPinhole) return project_by(ByMatrix<S>{camera}, gaussian, rules);
   return project_by(ByLens<S>{camera}, gaussian, rules);
+}
+
+template <class S>
+DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& camera, const ProjectionRules<S>& rules) {
+  if (camera.shutter != Shutter::kGlobal) return project_by(ByShutter<S>(camera, gaussian.mean), gaussian, rules);
+  return project<S>(gaussian, static_cast<const LensCamera<S>&>(camera), rules);
 }
 
 template <class S> struct GaussianGradient {
@@ -218,7 +297,7 @@ DSMOE_HD GaussianGradient<S> project_backward_by(const Way& way, const Gaussian<
                                                  const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
   const PinholeCamera<S>& camera = way.camera;
   GaussianGradient<S> out = {};
-  const Vec3<S> view = transform_point(camera.view, gaussian.mean);
+  const Vec3<S> view = way.to_view(gaussian.mean);
   const auto made = covariances(gaussian, way, view, rules);
   const Conic<S>& conic = made.conic;
 
@@ -243,13 +322,14 @@ DSMOE_HD GaussianGradient<S> project_backward_by(const Way& way, const Gaussian<
     out.rotation = quaternion_to_rotation_backward(gaussian.rotation, by.rotation);
   }
 
-  const Mat3<S> view_axes = view_rotation(camera.view);
+  const Mat3<S> view_axes = way.rotation();
   const Mat23<S> dL_dJ = {view_axes * dL_daxes.r0, view_axes * dL_daxes.r1};
   const auto by = way.backward(gaussian.mean, view, made.point, dL_dJ, g, rules.inverse_depth);
-  out.mean = transform_point_backward(camera.view, by.view) + by.pixel.point + g.color;
+  const auto by_pose = way.pose_backward(gaussian.mean, made.point, by, dL_daxes);
+  out.mean = by_pose.mean + g.color;
   out.mean2D = {g.gate.mean.x * S(0.5) * S(camera.width), g.gate.mean.y * S(0.5) * S(camera.height)};
-  out.camera = {gaussian.mean, by.view, way.rotation_backward(made.point.jacobian, dL_daxes), by.pixel.clip,
-                S(-1) * g.color};
+  out.camera = by_pose.camera;
+  out.camera.dL_dposition = S(-1) * g.color;
   return out;
 }
 
@@ -260,10 +340,19 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
 }
 
 template <class S>
-DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const Camera<S>& camera,
+DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const LensCamera<S>& camera,
                                               const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
   if (camera.lens.model == LensModel::kPinhole) return project_backward_by(ByMatrix<S>{camera}, gaussian, rules, g);
   return project_backward_by(ByLens<S>{camera}, gaussian, rules, g);
+}
+
+template <class S>
+DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const Camera<S>& camera,
+                                              const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
+  if (camera.shutter != Shutter::kGlobal) {
+    return project_backward_by(ByShutter<S>(camera, gaussian.mean), gaussian, rules, g);
+  }
+  return project_backward<S>(gaussian, static_cast<const LensCamera<S>&>(camera), rules, g);
 }
 
 }  // namespace dsmoe

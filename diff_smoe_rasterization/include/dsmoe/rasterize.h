@@ -26,6 +26,8 @@
 
 #include "dsmoe/allocator.h"
 #include "dsmoe/params.h"
+#include "dsmoe/passes/contributions.h"
+#include "dsmoe/passes/gate_map.h"
 
 namespace dsmoe {
 namespace cpu {
@@ -131,8 +133,8 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
 // what `contributions` does.
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map);
 
-// Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
-// visible: [N].
+// Marks the Gaussians in front of the near plane, with a rolling shutter of either pose. Of the frame it reads means3D
+// and the camera. visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible);
 
 // The instruction set that the blend uses: "avx512", "avx2" or "baseline". DSMOE_SIMD=name asks for a lower one.

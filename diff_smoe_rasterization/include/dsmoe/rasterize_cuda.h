@@ -28,6 +28,8 @@
 #include "dsmoe/depth_bits.h"
 #include "dsmoe/features.h"
 #include "dsmoe/params.h"
+#include "dsmoe/passes/contributions.h"
+#include "dsmoe/passes/gate_map.h"
 
 using cudaStream_t = struct CUstream_st*;  // as in CUDA's own headers, which a caller need not have
 
@@ -43,6 +45,8 @@ template <class S> struct DeviceCamera {
   const S* projection = nullptr;  // [4, 4]
   const S* position = nullptr;    // [3]
   Lens<S> lens;                   // as Camera has it, on the host
+  Shutter shutter = Shutter::kGlobal;
+  const S* view_end = nullptr;  // [4, 4] with a rolling shutter; else it is not read
 };
 
 // Numbers between the rows of `features`: rows begin at multiples of four, so that they load as vectors.
@@ -275,8 +279,8 @@ void count_rows(const ViewBatch& batch, const Work& work);
 void project_rows(const ViewBatch& batch, const Work& work);
 void project_rows_backward(const ViewBatch& batch, const GaussianGradients<float>& gradients, const Work& work);
 
-// Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
-// visible: [N].
+// Marks the Gaussians in front of the near plane, with a rolling shutter of either pose. Of the frame it reads means3D
+// and the camera. visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work);
 
 }  // namespace cuda

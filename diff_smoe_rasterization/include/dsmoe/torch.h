@@ -64,6 +64,10 @@ struct GaussianRasterizationSettings {
   std::vector<double> distortion;        // as LensCalibration (lens.h) has it
   std::optional<std::array<double, 2>> principal_point;  // pixels; the centre of the first pixel is (0.5, 0.5). Absent:
                                                          // of the image. A pinhole's is in projmatrix
+  std::string rolling_shutter = "global";  // a name of kShutterNames (camera.h): the order of rows or columns. But for
+                                           // "global", viewmatrix is the pose at the first and viewmatrix_end that at
+                                           // the last, and a pinhole needs principal_point, as of any lens
+  at::Tensor viewmatrix_end;               // [4, 4] transposed; undefined with "global"
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.
@@ -137,7 +141,8 @@ std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, co
                                                    const RasterizeArguments& arguments = {});
 
 /// The settings of a camera, transposed matrices included, as Python's function of this name; for a lens other than a
-/// pinhole set camera_model, distortion and principal_point of the result. K: [3, 3]
+/// pinhole set camera_model, distortion and principal_point of the result, for a rolling shutter rolling_shutter,
+/// viewmatrix_end and principal_point. K: [3, 3]
 /// intrinsics in pixels; as in COLMAP, the centre of the top left pixel is (0.5, 0.5). R, t: [3, 3] and [3], world to
 /// view: x_view = R x_world + t, with x right, y down, z forward. bg: [C]; the matrices get its type and its device.
 /// They have gradients with respect to R, t and, in the projection, K.

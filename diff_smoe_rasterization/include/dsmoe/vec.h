@@ -41,6 +41,8 @@ template <class S> DSMOE_HD Vec3<S> operator*(const Mat3<S>& m, Vec3<S> v) {
   return {dot(m.r0, v), dot(m.r1, v), dot(m.r2, v)};
 }
 
+template <class S> DSMOE_HD Mat3<S> operator*(S s, const Mat3<S>& m) { return {s * m.r0, s * m.r1, s * m.r2}; }
+
 template <class S> DSMOE_HD Vec3<S> transposed_times(const Mat3<S>& m, Vec3<S> v) {
   return v.x * m.r0 + v.y * m.r1 + v.z * m.r2;
 }

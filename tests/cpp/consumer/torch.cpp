@@ -56,7 +56,14 @@ struct Scene {
         &arguments.scales, &arguments.rotations, &settings.bg,       &settings.viewmatrix, &settings.projmatrix,
         &settings.campos};
     if (settings.background_gate) all.push_back(&settings.background_gate->tensor);
+    if (settings.viewmatrix_end.defined()) all.push_back(&settings.viewmatrix_end);
     return all;
+  }
+
+  void roll() {
+    settings.rolling_shutter = "left_to_right";
+    settings.principal_point = {kSize / 2 + 1.0, kSize / 2 - 0.5};
+    settings.viewmatrix_end = settings.viewmatrix + 0.05 * at::randn({4, 4}, at::kDouble);
   }
 
   dsmoe::Rendering render() const { return dsmoe::rasterize(means3D, opacities, settings, arguments); }
@@ -159,7 +166,7 @@ TEST_P(Modes, GradientsAreTheCores) {
   gradients.images = {data(w[0]), data(w[1]), data(w[2]), data(w[3])};
   std::vector<at::Tensor> own;
   for (at::Tensor* tensor : scene.tensors()) own.push_back(at::zeros(tensor->sizes(), at::kDouble));
-  const at::Tensor camera_gradient = at::zeros({35}, at::kDouble), background = at::zeros({4}, at::kDouble);
+  const at::Tensor camera_gradient = at::zeros({51}, at::kDouble), background = at::zeros({4}, at::kDouble);
   auto& by = gradients.inputs;
   by.means3D = data(own[0]), by.opacities = data(own[1]), by.means2D = data(own[2]), by.dc = data(own[3]);
   by.shs = data(own[4]), by.scales = data(own[5]), by.rotations = data(own[6]);
@@ -167,7 +174,7 @@ TEST_P(Modes, GradientsAreTheCores) {
   by.background = data(background);
   dsmoe::cpu::backward(frame, gradients);
   own[7] = background.slice(0, 0, 3), own[8] = camera_gradient.slice(0, 0, 16).view({4, 4});
-  own[9] = camera_gradient.slice(0, 16, 32).view({4, 4}), own[10] = camera_gradient.slice(0, 32);
+  own[9] = camera_gradient.slice(0, 16, 32).view({4, 4}), own[10] = camera_gradient.slice(0, 32, 35);
   if (own.size() > 11) own[11] = background.slice(0, 3);
   const auto tensors = scene.tensors();
   constexpr size_t kBackground = 7;
@@ -185,8 +192,7 @@ TEST_P(Modes, GradientsAreTheCores) {
 // In a random direction of all tensors but means2D, whose value is ignored. A step of 1e-6 leaves an error of 1e-6^2
 // times a third derivative, and 1e-16 / 1e-6 of rounding, both relative to the loss's size. Gradients leave out how
 // tails move, so no tails count here.
-TEST_P(Modes, GradientsAreThoseOfFiniteDifferences) {
-  Scene scene(GetParam());
+void expect_gradients_of_finite_differences(Scene scene) {
   scene.settings.faint_below = 0;
   const auto w = weights();
   double predicted = 0;
@@ -205,6 +211,16 @@ TEST_P(Modes, GradientsAreThoseOfFiniteDifferences) {
   };
   const double step = 1e-6, measured = (loss_at(step) - loss_at(-step)) / (2 * step);
   EXPECT_NEAR(predicted, measured, 1e-6 * std::abs(measured) + 1e-7);
+}
+
+TEST_P(Modes, GradientsAreThoseOfFiniteDifferences) { expect_gradients_of_finite_differences(Scene(GetParam())); }
+
+TEST_P(Modes, GradientsOfARollingShutterAreThoseOfFiniteDifferences) {
+  Scene scene(GetParam());
+  const at::Tensor still = scene.render().color;
+  scene.roll();
+  EXPECT_FALSE(at::allclose(scene.render().color, still, 0, 1e-3));
+  expect_gradients_of_finite_differences(scene);
 }
 
 TEST(Torch, OneGaussianIsWhatTheConsumersExpect) {
@@ -266,6 +282,15 @@ TEST(Torch, WhatDoesNotFitIsRefused) {
   refused([](Scene& s) { s.means3D.reset(); }, "rasterize: means3D is absent; it must be given");
   refused([](Scene& s) { s.settings.bg.reset(); }, "rasterize: bg is absent; it must be given");
   refused([](Scene& s) { s.arguments.scales.reset(); }, "rotations is given without scales");
+  refused(
+      [](Scene& s) { s.settings.rolling_shutter = "up"; },
+      "rolling_shutter is 'up'; it must be one of global, top_to_bottom, left_to_right, bottom_to_top, right_to_left");
+  refused([](Scene& s) { s.settings.viewmatrix_end = s.settings.viewmatrix; },
+          "viewmatrix_end is given, but rolling_shutter is 0; it must be absent");
+  refused([](Scene& s) { s.roll(), s.settings.viewmatrix_end.reset(); },
+          "viewmatrix_end is absent, but rolling_shutter is 2; it must be given");
+  refused([](Scene& s) { s.roll(), s.settings.principal_point.reset(); },
+          "principal_point is absent, but rolling_shutter is 'left_to_right', with which projmatrix is not read");
   refused([](Scene& s) { s.settings.image_width = 0; }, "image_width x image_height is 0 x 24");
   expect_error<c10::TypeError>([&] { dsmoe::rasterize(good.means3D.to(at::kHalf), good.opacities, good.settings); },
                                "means3D is float16");

@@ -113,12 +113,13 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   Results<float> out(scene);
   leave_out(out.weights, unsure);
   const Camera<float>& camera = scene.camera;
-  cuda::Frame<float> frame = {scene.inputs(),
-                              {camera.width, camera.height, camera.tan_fov_x, camera.tan_fov_y, camera.near,
-                               camera.view, camera.projection, camera.position, camera.lens},
-                              scene.raster_config(),
-                              out.rendering.images(),
-                              {}};
+  cuda::Frame<float> frame = {
+      scene.inputs(),
+      {camera.width, camera.height, camera.tan_fov_x, camera.tan_fov_y, camera.near, camera.view, camera.projection,
+       camera.position, camera.lens, camera.shutter, camera.view_end},
+      scene.raster_config(),
+      out.rendering.images(),
+      {}};
   frame.config.most_instances = how.most_instances;
   cuda::Run run;
   run.deterministic = how.deterministic;
@@ -305,6 +306,20 @@ TYPED_TEST(KernelsIn, EqualTheCpuThroughEveryLens) {
   }
 }
 
+TYPED_TEST(KernelsIn, EqualTheCpuWithARollingShutter) {
+  const std::vector<Lens<double>> lenses = make_lenses(41, 23);
+  int next = 1;
+  for (const Shutter shutter : kRolling) {
+    for (Scene<double> scene : {crowd(), with_degree_3(crowd(), false)}) {
+      scene.camera.lens = lenses[next++ % lenses.size()];
+      set_shutter(scene.camera, shutter);
+      How how;
+      how.removes = false;
+      this->expect(scene, how);
+    }
+  }
+}
+
 TYPED_TEST(KernelsIn, EqualTheCpuOnLongLists) { this->expect(long_lists()); }
 
 TYPED_TEST(KernelsIn, EqualTheCpuWhereTheHalvesOfASquareLeaveAListApart) {
@@ -399,7 +414,7 @@ TEST(Kernels, OrderFootprintsByTheirDepthsAlsoNegativeOnes) {
 
 // What the views of a batch see, and the gradients by the Gaussians; for three cameras, side by side.
 struct BatchResults {
-  // lenses: of the first views.
+  // lenses: of the first views. Of two the first one rolls.
   BatchResults(const Scene<float>& scene, const std::vector<Lens<double>>& lenses) : gradient(scene) {
     for (int v = 0; v < 3; ++v) {
       Camera<float> camera = scene.camera;
@@ -409,6 +424,7 @@ struct BatchResults {
             0.4f * static_cast<float>(v) * (camera.projection[row] + camera.projection[4 + row]);
       }
       if (v < static_cast<int>(lenses.size())) camera.lens = lenses[v].as<float>();
+      if (v == 0 && lenses.size() == 2) set_shutter(camera, Shutter::kBottomToTop);
       cameras.push_back(camera);
       radii.emplace_back(scene.count, -5), offsets.emplace_back(num_view_blocks(scene.count) + 1, -5);
     }
@@ -455,9 +471,9 @@ BatchResults batch_by_kernels(const Scene<float>& scene, int fewer = 0, const st
   BatchResults out(scene, lenses);
   cuda::ViewBatch batch;
   for (const Camera<float>& camera : out.cameras) {
-    batch.views.emplace_back().camera = {camera.width,      camera.height,   camera.tan_fov_x,
-                                         camera.tan_fov_y,  camera.near,     camera.view,
-                                         camera.projection, camera.position, camera.lens};
+    batch.views.emplace_back().camera = {camera.width, camera.height,  camera.tan_fov_x,  camera.tan_fov_y,
+                                         camera.near,  camera.view,    camera.projection, camera.position,
+                                         camera.lens,  camera.shutter, camera.view_end};
   }
   out.run(
       scene, batch, fewer, [](const auto& batch) { cuda::count_rows(batch, {}); },
@@ -471,13 +487,16 @@ std::vector<double> widened(const std::vector<float>& numbers) { return {numbers
 TEST(Kernels, TakeTheViewsOfABatchAsTheCpu) {
   Scene<double> no_shs = make_scene(4, 300, 41, 23);
   no_shs.sh_degree = 0, no_shs.dc = no_shs.shs, no_shs.dc.resize(3 * no_shs.count), no_shs.shs.clear();
-  const std::vector<Lens<double>> lenses = make_lenses(41, 23), mixed = {lenses[2], {}, lenses[1]};
+  const std::vector<Lens<double>> lenses = make_lenses(41, 23), mixed = {lenses[2], {}, lenses[1]},
+                                  rolling = {lenses[1], lenses[2]};  // the first of two
   const Scene<double> known = with_degree_3(make_scene(3, 300, 41, 23), false), staged = make_scene(3, 129, 41, 23);
   for (auto [of, through] : std::vector<std::pair<Scene<double>, std::vector<Lens<double>>>>{
            {known, {}},
            {known, mixed},
            {staged, {}},
            {staged, mixed},
+           {known, rolling},
+           {staged, rolling},
            {no_shs, {}},
            {with_degree_3(make_scene(3, 300, 41, 23), true), {}},
            {make_scene(3, 0, 41, 23), {}}}) {

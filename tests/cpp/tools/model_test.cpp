@@ -41,5 +41,15 @@ TEST(ReadModel, TakesOneWithoutGaussians) {
   EXPECT_EQ(read_model(path).count, 0);
 }
 
+TEST(ChooseBlend, TakesFaintBelowFromTheFileInItsOwnBlend) {
+  io::GaussianModel model = two_gaussians();
+  model.blend_mode = "smoe", model.faint_below = 2;
+  EXPECT_EQ(choose_blend(model, "model.ply", "", std::nullopt).faint_below, 2);
+  const double usual = BlendRules<double>().faint_below;
+  EXPECT_EQ(choose_blend(model, "model.ply", "smoe_eq7", std::nullopt).faint_below, usual);
+  model.faint_below.reset();
+  EXPECT_EQ(choose_blend(model, "model.ply", "", std::nullopt).faint_below, usual);
+}
+
 }  // namespace
 }  // namespace dsmoe::tools

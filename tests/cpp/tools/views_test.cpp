@@ -70,6 +70,30 @@ TEST(JsonViews, AnAngleOfViewIsThatOfTheWholeWidth) {
   expect_contains(format_error_of([&] { parse_json_views(text, "t.json", {}); }), "--size");
 }
 
+TEST(JsonViews, HaveTheLensOfTheirFile) {
+  const auto with = [](const char* valid, const std::string& from, const std::string& to) {
+    std::string text = valid;
+    return parse_json_views(text.replace(text.find(from), from.size(), to), "c.json", {})[0];
+  };
+  EXPECT_EQ(with(kTransforms, "\"k1\": 0", "\"k1\": 0").model, LensModel::kPinhole);
+  const View bent = with(kTransforms, "\"k1\": 0", "\"k1\": 0.1, \"p2\": 0.2, \"k3\": 0.3");
+  EXPECT_EQ(bent.model, LensModel::kOpencv);
+  EXPECT_EQ(bent.distortion, (std::vector<double>{0.1, 0, 0, 0.2, 0.3}));
+  for (const char* fisheye :
+       {"\"k3\": 0.3, \"is_fisheye\": true", "\"k3\": 0.3, \"camera_model\": \"OPENCV_FISHEYE\""}) {
+    const View view = with(kTransforms, "\"k1\": 0", fisheye);
+    EXPECT_EQ(view.model, LensModel::kFisheye);
+    EXPECT_EQ(view.distortion, (std::vector<double>{0, 0, 0.3, 0}));
+  }
+  EXPECT_EQ(with(kTransforms, "\"k1\": 0", "\"camera_model\": \"EQUIRECTANGULAR\"").model, LensModel::kEquirectangular);
+  const View inria =
+      with(kInria, "\"id\": 0", R"("camera_model": "fisheye", "distortion": [0.1, 0.2], "cx": 30, "cy": 20)");
+  EXPECT_EQ(inria.model, LensModel::kFisheye);
+  EXPECT_EQ(inria.distortion, (std::vector<double>{0.1, 0.2}));
+  EXPECT_EQ(inria.cx, 30);
+  EXPECT_EQ(inria.cy, 20);
+}
+
 TEST(JsonViews, RefuseWithPlaceAndReason) {
   const auto expect_refused = [](const char* valid, const std::string& from, const std::string& to,
                                  const std::string& place, const std::string& reason) {
@@ -94,9 +118,17 @@ TEST(JsonViews, RefuseWithPlaceAndReason) {
   expect_refused(kInria, "[0, 0, -1]", "[0, 0, 1]", ": camera 0: `rotation`", "mirrors");
   expect_refused(kInria, "[0, 0, -1]", "[0, 0, 0]", ": camera 0: `rotation`", "not a rotation");
   expect_refused(kInria, "\"img_name\"", "\"name\"", ": camera 0", "`img_name` is missing");
-  expect_refused(kInria, "\"id\": 0", "\"camera_model\": \"fisheye\"", ": camera 0: `camera_model`",
-                 "must be absent: only pinhole cameras can be rendered");
-  expect_refused(kTransforms, "\"k1\": 0", "\"k1\": 0.1", ": `k1`", "distortion");
+  expect_refused(kInria, "\"id\": 0", "\"camera_model\": \"fish\"", ": camera 0: `camera_model`", "is \"fish\"");
+  expect_refused(kInria, "\"id\": 0", "\"camera_model\": \"fisheye\", \"distortion\": [1, 2, 3]",
+                 ": \"v\": ", "distortion has 3 numbers; it must have 0, 1, 2 or 4");
+  expect_refused(kInria, "\"id\": 0", "\"camera_model\": \"opencv\", \"distortion\": [-1e8]",
+                 ": \"v\": ", "folds the image back");
+  expect_refused(kInria, "\"id\": 0", "\"distortion\": [0.1]", ": \"v\": ", "distortion has 1 numbers; it must have 0");
+  expect_refused(kInria, "\"id\": 0", "\"distortion\": 0.1", ": camera 0: `distortion`", "a list of numbers");
+  expect_refused(kTransforms, "\"k1\": 0", "\"k4\": 0.1", ": `k4`", "must be 0 for `camera_model` OPENCV");
+  expect_refused(kTransforms, "\"k1\": 0", "\"p1\": 0.1, \"is_fisheye\": true", ": `p1`", "must be 0");
+  expect_refused(kTransforms, "\"k1\": 0", "\"k1\": 0.1, \"camera_model\": \"EQUIRECTANGULAR\"", ": `k1`", "must be 0");
+  expect_refused(kTransforms, "\"k1\": 0", "\"camera_model\": \"FISHEYE624\"", ": `camera_model`", "OPENCV_FISHEYE");
   expect_refused(kTransforms, "\"frames\"", "\"views\"", "", "`frames` is missing");
   expect_refused(kTransforms, "\"a.png\"", "3", ": frame 0: `file_path`", "must be a text");
   expect_refused(kTransforms, "\"fl_x\": 40", "\"fl_x\": \"40\"", ": frame 1: `fl_x`", "40");
@@ -150,7 +182,28 @@ TEST(Orbit, LooksAtItsTargetFromItsDistanceWithUpAbove) {
   EXPECT_THROW(orbit_views(orbit), std::invalid_argument);
 }
 
-TEST(ColmapViews, NeedNoLensDistortion) {
+/// The column and row of a point on the view's image, and whether its lens shows it.
+LensPoint<float> shown(const View& view, const Vec3<float>& point) { return through_lens(camera_of(view).lens, point); }
+
+TEST(CameraOf, HasTheLensOfItsView) {
+  View view;
+  view.width = 200, view.height = 100, view.fx = 60, view.fy = 50, view.cx = 90, view.cy = 40;
+  view.rotation = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+  EXPECT_EQ(camera_of(view).lens.model, LensModel::kPinhole);
+  // 60 degrees to the right; a first pixel's centre is 0 in the rasterizer, and 0.5 in a view.
+  const Vec3<float> aside = {std::sqrt(3.0f), 0, 1};
+  view.model = LensModel::kFisheye, view.distortion = {0.1};
+  const double angle = M_PI / 3;
+  EXPECT_NEAR(shown(view, aside).pixel.x, 60 * angle * (1 + 0.1 * angle * angle) + 89.5, 1e-4);
+  EXPECT_NEAR(shown(view, aside).pixel.y, 39.5, 1e-4);
+  const View half = resized(view, 100, 50);
+  EXPECT_NEAR(shown(half, aside).pixel.x, (shown(view, aside).pixel.x + 0.5) / 2 - 0.5, 1e-4);
+  set_panorama(view), view.distortion.clear();
+  EXPECT_NEAR(shown(view, aside).pixel.x, 200 * (0.5 + 60 / 360.0) - 0.5, 1e-4);
+  EXPECT_NEAR(shown(view, {0, 1, 0.01f}).pixel.y, 100 * (1 - std::atan(0.01) / M_PI) - 0.5, 1e-3);
+}
+
+TEST(ColmapViews, HaveTheLensOfTheirCamera) {
   io::ColmapModel model;
   model.cameras.push_back({7, io::find_camera_model("SIMPLE_PINHOLE"), 64, 48, {50, 30, 20}});
   io::ColmapImage image;
@@ -167,8 +220,28 @@ TEST(ColmapViews, NeedNoLensDistortion) {
   EXPECT_NEAR(turned[0], 1, 1e-12);
   EXPECT_NEAR(turned[1], 3, 1e-12);
   EXPECT_NEAR(turned[2], 3, 1e-12);
-  model.cameras[0].model = io::find_camera_model("OPENCV");
-  expect_contains(format_error_of([&] { views_of(model, "folder"); }), "folder: camera 7 has the model OPENCV");
+  const auto with = [&](const char* name, const std::vector<double>& params) {
+    model.cameras[0].model = io::find_camera_model(name), model.cameras[0].params = params;
+    return views_of(model, "folder")[0];
+  };
+  const View radial = with("SIMPLE_RADIAL", {50, 30, 20, 0.1});
+  EXPECT_EQ(radial.model, LensModel::kOpencv);
+  EXPECT_EQ(radial.fy, 50);
+  EXPECT_EQ(radial.cy, 20);
+  EXPECT_EQ(radial.distortion, (std::vector<double>{0.1}));
+  const View fisheye = with("OPENCV_FISHEYE", {50, 51, 30, 20, 0.1, 0.2, 0.3, 0.4});
+  EXPECT_EQ(fisheye.model, LensModel::kFisheye);
+  EXPECT_EQ(fisheye.fy, 51);
+  EXPECT_EQ(fisheye.distortion, (std::vector<double>{0.1, 0.2, 0.3, 0.4}));
+  EXPECT_EQ(with("FISHEYE", {50, 51, 30, 20}).model, LensModel::kFisheye);
+  EXPECT_EQ(with("THIN_PRISM_FISHEYE", {50, 51, 30, 20, 0, 0, 0, 0, 0, 0, 0, 0}).model, LensModel::kThinPrismFisheye);
+  EXPECT_EQ(with("FULL_OPENCV", {50, 51, 30, 20, 0, 0, 0, 0, 0, 0, 0, 0.1}).distortion.size(), 8u);
+  EXPECT_EQ(with("EQUIRECTANGULAR", {64, 48}).model, LensModel::kEquirectangular);
+  expect_contains(format_error_of([&] { with("FOV", {50, 51, 30, 20, 0.1}); }), "folder: camera 7 has the model FOV");
+  expect_contains(format_error_of([&] {
+                    with("RADIAL", {50, 30, 20, -1e8, 0});
+                  }),
+                  "folder: \"a/b.jpg\": distortion folds the image");
 }
 
 }  // namespace

@@ -9,8 +9,10 @@ import torch
 
 from dsmoe.bench import measure
 from dsmoe.bench.errors import BenchError
+from dsmoe.bench.lpips import lpips_network
 from dsmoe.bench.measure import Measures, edge_mask, edge_psnr
 from dsmoe.bench.names import check_weights
+from dsmoe.errors import TrainerError
 from dsmoe.results.evaluation import summary
 from dsmoe.results.metrics import quantised
 
@@ -154,7 +156,7 @@ def test_lpips_of_a_file_agrees_with_the_definition(kind, weights, tmp_path, mon
     if weights == "made up":
         made_up_weights(path, net)
     else:
-        path = real_data.folder("bonsai").replace("bonsai", "lpips_alex_v01.npz")
+        path = real_data.folder("lpips_alex_v01.npz")
     monkeypatch.setenv(f"DSMOE_LPIPS_{net.upper()}", path)
     measures = Measures("cpu", [kind])
     image, target = torch.from_numpy(np.random.RandomState(1).rand(2, 3, 64, 72).astype(np.float32))
@@ -164,3 +166,18 @@ def test_lpips_of_a_file_agrees_with_the_definition(kind, weights, tmp_path, mon
         expected = lpips_in_double(net, dict(file), quantised(image), target, normalise=kind != "lpips_vgg_inria")
     # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
     assert measures(image, target)[kind] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("net", NETWORKS)
+def test_images_too_small_for_lpips_are_told(net, tmp_path, monkeypatch):
+    made_up_weights(str(tmp_path / "weights.npz"), net)
+    monkeypatch.setenv(f"DSMOE_LPIPS_{net.upper()}", str(tmp_path / "weights.npz"))
+    kind = {"alex": "lpips_alex", "vgg": "lpips_vgg_std"}[net]
+    side = 1  # grown through convolutions and poolings from the end
+    for part in reversed([part for part in NETWORKS[net] if part]):
+        size, stride, padding = (*part, 0)[:3] if len(part) == 2 else part[1:]
+        side = (side - 1) * stride + size - 2 * padding
+    distance = lpips_network(kind, "cpu")
+    assert math.isfinite(distance(torch.zeros(3, side, side), torch.ones(3, side, side)))
+    with pytest.raises(TrainerError, match=f"at least {side}x{side} pixels, and one has {side - 1}x{side + 9}"):
+        distance(torch.zeros(3, side + 9, side - 1), torch.ones(3, side + 9, side - 1))

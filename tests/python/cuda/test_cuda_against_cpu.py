@@ -15,6 +15,7 @@ from scenes import (
     op_arguments,
     op_results,
     random_scene,
+    turned,
     with_gate,
     with_gates,
 )
@@ -36,6 +37,13 @@ def through(lens, mode):
     """Around the camera if the lens sees around; of degree 3, for which kernels are compiled."""
     position = (0.4, -0.3, -4.0) if lens["camera_model"] in ("orthographic", "opencv") else (0.4, -0.3, -1.5)
     return crowd(mode, degree=3, position=position, near=0.5).with_settings(**lens)
+
+
+def rolling(lens, shutter, mode):
+    """The same while the camera turns and moves by some 4 pixels, by 20 at most."""
+    scene = through(lens, mode)
+    end = turned(scene.settings.viewmatrix, (0.05, -0.06, 0.08), (0.1, 0.12, -0.07))
+    return scene.with_settings(rolling_shutter=shutter, viewmatrix_end=end)
 
 
 def one_covers_all(mode):
@@ -72,6 +80,9 @@ SCENES = {
         dict(camera_model="fisheye", distortion=(0.02, -0.01, 0.003, -0.0002)),
         dict(camera_model="thin_prism_fisheye", distortion=(0.02, -0.01, 0.003, -0.002, 0.01, 0.001, 0.02, -0.01)),
         dict(camera_model="equirectangular"))},
+    **{f"lens_{shutter}": functools.partial(rolling, lens, shutter) for lens, shutter in (
+        (dict(camera_model="opencv", principal_point=(84.0, 51.0)), "top_to_bottom"),
+        (dict(camera_model="fisheye", distortion=(0.02, -0.01, 0.003, -0.0002)), "right_to_left"))},
     "one_covers_all": one_covers_all,
     "saturated": saturated,
     "one_pixel": lambda mode: random_scene(mode, 300, 1, 1, scale=0.3, degree=1, fov_x=0.1),

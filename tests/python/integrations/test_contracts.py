@@ -113,6 +113,27 @@ def test_whatever_an_argument_is_the_error_names_it(contract):
             module.GaussianRasterizer(raster_settings=made)(**{**scene.inputs, **kinds, name: "red"})
 
 
+@pytest.mark.parametrize("contract, name", [
+    (one.name, name) for one in CONTRACTS for name in one.settings
+    if one.name != "taming" and name not in ("mult", "nearest_points")] + [("inria", "viewmatrix")])
+def test_whatever_a_setting_is_the_error_names_it_and_what_would_be_right(contract, name):
+    """`mult` is not read, no nearest_points are right, and a flag is whatever bool() takes but text."""
+    module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract}")
+    scene = random_scene("alpha", 12, 20, 10)
+    fields = {name: getattr(scene.settings, name) for name in SETTINGS}
+    fields.update({name: OFTEN_GIVEN.get(name, True) for name in contract_of(contract).settings})
+    if name == "metric_map":
+        fields["get_flag"] = True
+    is_flag = isinstance(fields[name], bool)
+    for wrong in ("red", torch.ones(7)) if is_flag else ("red", [1, 2], object(), torch.ones(7).double()):
+        if name == "subpixel_offset" and isinstance(wrong, torch.Tensor):
+            continue
+        settings = module.GaussianRasterizationSettings(**{**fields, name: wrong})
+        right = "must be (True or False|a number|a torch.Tensor)|must have [0-9]+ elements|must be \\[4, 4\\]"
+        with pytest.raises((TypeError, ValueError), match=f"rasterize: {name} (is|has) .*; it ({right})"):
+            module.GaussianRasterizer(raster_settings=settings)(**scene.inputs)
+
+
 def sums_of_absolute_gradients(scene, weights, **settings):
     points = torch.zeros(N, 2, dtype=torch.float64, requires_grad=True)
     rendering = rasterize(settings=scene.settings._replace(**settings), means2D_abs=points, **scene.inputs)

@@ -57,8 +57,8 @@ def reference_renderings(inputs, cameras, outputs=("alpha", "depth")):
         rotations = inputs["rotations"]
         inputs["rotations"] = rotations / rotations.norm(dim=1, keepdim=True)
         return [reference.rasterize(settings=c._replace(**{
-            name: getattr(c, name).cpu() for name in ("bg", "viewmatrix", "projmatrix", "campos")}), outputs=outputs,
-            **inputs) for c in cameras]
+            name: getattr(c, name).cpu() for name in ("bg", "viewmatrix", "projmatrix", "campos", "viewmatrix_end")
+            if getattr(c, name) is not None}), outputs=outputs, **inputs) for c in cameras]
 
 
 def shares(inputs, cameras):
@@ -143,6 +143,46 @@ def test_lenses_are_the_references(camera_model, coefficients, own):
         assert seen.any() and torch.equal(meta["radii"][camera, :, 0], prints.radii)
         assert_close(meta["means2d"][camera][seen], prints.means2D[seen] + 0.5, TOLERANCE, "means2d")
         assert_close(meta["depths"][camera][seen], prints.depths[seen], TOLERANCE, "depths")
+
+
+@pytest.mark.parametrize("shutter, own", [
+    (SimpleNamespace(name="ROLLING_TOP_TO_BOTTOM"), "top_to_bottom"), (3, "right_to_left")])
+def test_rolling_shutters_are_the_references(shutter, own):
+    scene = random_scene("smoe", 60, seed=31, channels=3, scale=0.05)
+    cameras = make_cameras("smoe", 3)
+    ends = []
+    for k, (camera, (x, y)) in enumerate(zip(cameras, PRINCIPAL_POINTS)):
+        end = camera.viewmatrix.clone()
+        end[3, :3] += end.new_tensor([0.1, -0.15, 0.05])
+        centre = -end[3, :3] @ torch.linalg.inv(end[:3, :3])
+        cameras[k] = camera._replace(rolling_shutter=own, viewmatrix_end=end, campos=(camera.campos + centre) / 2,
+                                     principal_point=(WIDTH / 2 + x, HEIGHT / 2 + y))
+        ends.append(end.T)
+    viewmats_rs = torch.stack(ends).requires_grad_()
+    renders, _, meta = rasterization(**arguments_of(scene, cameras), blend_mode="smoe", rolling_shutter=shutter,
+                                     viewmats_rs=viewmats_rs)
+    expected = reference_renderings(scene.inputs, cameras)
+    assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
+    rotations = torch.nn.functional.normalize(scene.inputs["rotations"])
+    for camera, settings in enumerate(cameras):
+        prints = project_gaussians(settings=settings, **{**scene.inputs, "means2D": None, "rotations": rotations})
+        seen = prints.radii > 0
+        assert seen.any() and torch.equal(meta["radii"][camera, :, 0], prints.radii)
+        assert_close(meta["means2d"][camera][seen], prints.means2D[seen] + 0.5, TOLERANCE, "means2d")
+        assert_close(meta["depths"][camera][seen], prints.depths[seen], TOLERANCE, "depths")
+    renders.sum().backward()
+    assert viewmats_rs.grad.abs().sum((1, 2)).min() > 0
+
+
+@pytest.mark.parametrize("arguments, message", [
+    (dict(rolling_shutter=2), "viewmats_rs is None, but rolling_shutter is ROLLING_BOTTOM_TO_TOP; it must be given"),
+    (dict(viewmats_rs=torch.eye(4, device="cpu")), "viewmats_rs is given, but rolling_shutter is GLOBAL; it must be "
+     "None"),
+    (dict(rolling_shutter="SIDEWAYS"), "rolling_shutter is 'SIDEWAYS'; it must be one of ROLLING_TOP_TO_BOTTOM"),
+    (dict(rolling_shutter=0, viewmats_rs=torch.eye(4, device="cpu")), r"viewmats_rs has shape \[4, 4\]; it must be")])
+def test_bad_shutters_are_named(small, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        rasterization(**small, **arguments)
 
 
 def test_coefficients_that_a_lens_has_not_are_refused(small):
@@ -362,7 +402,7 @@ def small():
 
 @pytest.mark.parametrize("name, value", [
     ("sparse_grad", True), ("distributed", True), ("camera_model", "ftheta"), ("with_ut", True),
-    ("rolling_shutter", 1), ("ftheta_coeffs", torch.zeros(2, 6)), ("global_z_order", False),
+    ("ftheta_coeffs", torch.zeros(2, 6)), ("global_z_order", False),
     ("extra_signals", torch.zeros(5, 1))])
 def test_what_is_not_offered_is_refused_by_name(small, name, value):
     with pytest.raises(NotImplementedError, match=name):

@@ -12,6 +12,7 @@ import struct
 import threading
 import time
 import warnings
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -277,6 +278,48 @@ def test_a_gate_of_0_that_was_found_is_rendered_until_the_first_step():
     shown.square().mean().backward()
     optimizer.step()
     assert gate.value() == pytest.approx(by_hand([slope]), rel=1e-5)
+
+
+@pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
+def test_a_step_with_the_gate_launches_one_kernel_more_than_one_with_a_number():
+    """Small trainings wait for the host: each launch beside the rasterizer is time of a step."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    class Calls(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
+            self.names[str(function)] += 1
+            return function(*arguments, **(keywords or {}))
+
+    view, gaussians = scene()
+    optimizer = torch.optim.SGD(gaussians.values(), lr=0)
+    found = []
+    for background_gate in (0.5, "learned"):
+        for _ in range(2):  # the first one makes Adam's state
+            with Calls() as calls:
+                calls.names = Counter()
+                loss(view._replace(background_gate=background_gate), gaussians).backward()
+                optimizer.step()
+            optimizer.zero_grad()
+        found.append(calls.names)
+    more = found[1] - found[0]
+    for name in ("aten.view.default", "aten.empty_like.default", "aten.detach.default"):  # nothing runs on the device
+        more.pop(name, None)
+    assert more == {"diff_smoe_rasterization.gate_adam.default": 1}
+
+
+def test_a_rendering_keeps_its_gate_while_others_step_it():
+    """Its backward pass is of the value that it was rendered with, and counts at the next step."""
+    view, gaussians = scene()
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0)
+    first, second = gradient_at(START, view, gaussians), None
+    waiting, other = (loss(view, gaussians, means3D=gaussians["means3D"] + 0) for _ in range(2))
+    other.backward()
+    optimizer.step()
+    second = gate.value()
+    assert second == pytest.approx(by_hand([first]), rel=1e-5)
+    waiting.backward()
+    optimizer.step()
+    assert gate.value() == pytest.approx(by_hand([first, first]), rel=1e-5) and gate.value() != second
 
 
 def test_a_gradient_that_is_not_finite_counts_as_0():

@@ -1,6 +1,8 @@
 """Activations against torch and autograd, the statistics of densification, and rows by index; on every device."""
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from devices import random_normal
@@ -194,6 +196,18 @@ def test_a_step_of_the_gate_is_one_of_adam_on_its_logarithm(device):
         torch.testing.assert_close(logarithm.double(), p.detach(), rtol=0, atol=1e-5)
         torch.testing.assert_close(gate.double(), bound + p.detach().exp(), rtol=1e-5, atol=0)
     assert float(logarithm) == limit, "it has come to its bound"
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_gradient_of_the_gate_that_is_not_finite_counts_as_0(device, value):
+    """Its moments fade as by a gradient of 0, so that the next step is finite."""
+    found = []
+    for gradient in (value, 0.0):
+        state = [torch.full((1,), start) for start in (-0.5, 0.25, 0.125, 0.0)]
+        torch.ops.diff_smoe_rasterization.gate_adam(*state, torch.full((1,), gradient), 0.1, 1.0, 0.9, 0.999, 1e-8, 0.0,
+                                                    80.0)
+        found.append(torch.cat(state))
+    assert torch.equal(*found) and float(found[1][1]) == pytest.approx(0.9 * 0.25)
 
 
 gather_rows = torch.ops.diff_smoe_rasterization.gather_rows

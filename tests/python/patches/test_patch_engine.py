@@ -469,13 +469,27 @@ def test_what_dsmoe_run_takes_is_supported(tmp_path, dsmoe):
     assert said.status == 1 and ": unknown\n" in said.out
 
 
+def test_the_script_that_trains_is_named(tmp_path, dsmoe):
+    """Whatever its name is; in a folder below the package that calls another rasterizer, as in gsplat's checkout."""
+    script = "from gsplat import rasterization\nif __name__ == '__main__':\n    rasterization(1, 2, 3, 4, 5)\n"
+    (tmp_path / "examples").mkdir()
+    (tmp_path / "examples/simple_trainer.py").write_text(script)
+    inside = dsmoe("patch", "check", tmp_path / "examples")
+    assert inside.status == 0 and "`dsmoe run --blend-mode smoe -- python simple_trainer.py ...` in it" in inside.out
+    (tmp_path / "own.py").write_text("from diff_surfel_rasterization import GaussianRasterizer\n")
+    above = dsmoe("patch", "check", tmp_path)
+    assert above.status == 1 and "name the folder of the script that you run, such as examples\n" in above.out
+
+
 def test_imports_that_are_missing_are_named_once_patched(tmp_path):
     """Of the scripts and what they import; not what is tried, is of the checkout, or comes with the patch."""
-    train = "import cv2_no, utils.own, torch, fused_ssim\ntry:\n    import wandb_no\nexcept ImportError: pass\n" + TRAIN
+    train = "import cv2_no, utils.own, torch, fused_ssim, _gridencoder\n" + (
+        "try:\n    import wandb_no\nexcept ImportError: pass\n" + TRAIN)
     files = {"train.py": train, "utils/own.py": "from yaml_no import load\nimport helper\n", "utils/helper.py": "",
              "alone.py": "import alone_no\n"}
-    assert patches.apply(make(tmp_path, files)).notes[-2:] == [
+    assert patches.apply(make(tmp_path, files)).notes[-3:] == [
         "not installed here: cv2_no, yaml_no; pip install cv2_no yaml_no",
+        "not installed here: _gridencoder; compile what the trainer's page names",
         "not installed here: fused_ssim; --modernise brings this package's"]
-    assert patches.apply(tmp_path, modernise=True).notes[-1].startswith("not installed here: cv2_no, yaml_no; ")
+    assert patches.apply(tmp_path, modernise=True).notes[-2].startswith("not installed here: cv2_no, yaml_no; ")
     assert not patches.apply(make(tmp_path / "plain")).notes

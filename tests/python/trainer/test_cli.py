@@ -918,7 +918,7 @@ def test_a_changed_milestone_is_told_before_what_is_wrong_with_it(scene, tmp_pat
     assert main(["train", scene, "-o", output, *options, "--quiet"]) == 0
     words = [scene, *options] if with_scene else []
     text = fails(capsys, "train", "--resume", "-o", output, *words, "--densify-until-iter", "15000")
-    assert "--densify-until-iter is 15, not 15000" in text and f"`--resume -o {output}` alone keeps" in text
+    assert "--densify-until-iter is 15, not 15000" in text and f"`dsmoe train --resume -o {output}` keeps" in text
     assert main(["train", "--resume", "-o", output, *words, "--quiet"]) == 0
 
 

@@ -26,7 +26,7 @@ def parse(*arguments):
     """With the recipe of 3DGS, which reads no scene, unless another strategy is named."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    return config_from_arguments(parser.parse_args(["scene", "-o", "out", "--strategy", "3dgs", *arguments]))
+    return config_from_arguments(parser.parse_args(["scene", "-o", "out", "--strategy", "3dgs", *arguments]))[0]
 
 
 def test_defaults_are_those_of_3dgs():

@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -16,13 +17,15 @@ from scipy.optimize import brentq
 from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from dsmoe.cli import main
 from dsmoe.errors import SceneError
+from dsmoe.inspection import open_trained
 from dsmoe.options.config import TrainConfig
 from dsmoe.scenes import undistortion
+from dsmoe.scenes.cameras import Camera
 from dsmoe.scenes.lens import lens_of
-from dsmoe.scenes.modelfolder import _camera
+from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.system.files import PART
+from dsmoe.system.files import ABANDONED, PART, own_part
 
 WIDTH, HEIGHT = 96, 72
 FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0
@@ -61,7 +64,7 @@ def bent_image(model, k):
     return Image.fromarray(colour(x, y).round().astype(np.uint8))
 
 
-def write_scene(folder, model, params, image, count=3):
+def write_scene(folder, model, params, image, count=3, size=(WIDTH, HEIGHT)):
     """A COLMAP scene of so many equal images, with 12 points."""
     os.makedirs(folder / "images", exist_ok=True)
     for index in range(count):
@@ -69,13 +72,13 @@ def write_scene(folder, model, params, image, count=3):
     points = io.Points(np.random.RandomState(0).normal(0, 1, (12, 3)) + [0, 0, 4], np.full((12, 3), 128, np.uint8))
     images = [io.ColmapImage(index + 1, f"{index}.png", 1, np.array([1.0, 0, 0, 0]), np.array([0.1 * index, 0, 0]))
               for index in range(count)]
-    cameras = {1: io.ColmapCamera(1, model, WIDTH, HEIGHT, np.array(params, np.float64))}
+    cameras = {1: io.ColmapCamera(1, model, *size, np.array(params, np.float64))}
     io.write_colmap(str(folder / "sparse" / "0"), io.ColmapModel(cameras, images, points))
     return str(folder)
 
 
-def load(folder, **options):
-    return load_scene(TrainConfig(scene=str(folder), **options), progress=False)
+def load(folder, lenses="undistort", **options):
+    return load_scene(TrainConfig(scene=str(folder), lenses=lenses, **options), progress=False)
 
 
 LENSES = [
@@ -150,9 +153,9 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
     k = (0.03, -0.01, 0.004, -0.001)
     folder = fisheye_scene(tmp_path / "scene", "OPENCV_FISHEYE", k)
     output = str(tmp_path / "out")
-    assert main(["train", folder, "-o", output, "--lenses", "native", "--iterations", "200", "--blend-mode", "smoe",
-                 "--background-gate", "0", "--device", "cpu", "--test-every", "4"]) == 0
-    assert "stay as they are" in capsys.readouterr().out
+    assert main(["train", folder, "-o", output, "--iterations", "200", "--blend-mode", "smoe", "--background-gate", "0",
+                 "--device", "cpu", "--test-every", "4"]) == 0
+    assert "camera model fisheye stay as they are, since undistortion would cut off much" in capsys.readouterr().out
     with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
         row = json.load(file)
     row = row[0] if isinstance(row, list) else row
@@ -168,6 +171,89 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
         recorded = json.load(file)[0]
     assert recorded["camera_model"] == "fisheye" and tuple(recorded["distortion"]) == k
     assert _camera(recorded).lens.coefficients == k
+    trained = open_trained(output)
+    first = trained.cameras[0]
+    assert first.lens is None and first.width / (2 * first.fx) <= 1, "what the page and the viewer begin with"
+    assert main(["export", output, "-o", str(tmp_path / "model.html")]) == 0
+    page = (tmp_path / "model.html").read_text(encoding="utf-8")
+    assert f'"fx": {first.fx}' in page and f'"fy": {first.fy}' in page
+    assert main(["render", output, "--orbit", "--frames", "2", "-o", str(tmp_path / "orbit"), "--device", "cpu"]) == 0
+    assert main(["train", "--resume", output, "--lenses", "undistort", "--iterations", "201"]) == 1
+    assert "undistort" in capsys.readouterr().err
+
+
+def seen_by_pinhole(lens, width, height, fx, fy, cx, cy):
+    """Whether each pixel of a fisheye without coefficients has a place in the pinhole image: tan(theta) for theta."""
+    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
+    angle = np.hypot(x, y)
+    stretch = np.where(angle < math.pi / 2, np.tan(angle) / angle, np.inf)
+    return (np.abs(x * stretch * fx + cx - width / 2) <= width / 2) & (
+        np.abs(y * stretch * fy + cy - height / 2) <= height / 2)
+
+
+@pytest.mark.parametrize("focal", [30.0, 60.0, 150.0])
+def test_what_undistortion_cuts_off(focal):
+    lens = lens_of("OPENCV_FISHEYE", True, {})
+    camera = Camera("", np.eye(3), np.zeros(3), focal, 1.1 * focal, CX, CY, WIDTH, HEIGHT)
+    kept = seen_by_pinhole(lens, WIDTH, HEIGHT, focal, 1.1 * focal, CX, CY).mean()
+    # Two grids of 64x64 and 96x72 places: each may misplace its border, by half a cell on each side.
+    assert undistortion.cut_off(camera, lens) == pytest.approx(1 - kept, abs=0.03)
+    assert undistortion.cut_off(camera, lens_of("RADIAL", False, {"k1": 0.1})) == 0, "pincushion"
+
+
+def test_a_mild_lens_is_undistorted_and_a_strong_one_kept(tmp_path):
+    image = Image.new("RGB", (WIDTH, HEIGHT), (9, 9, 9))
+    for k1, native in ((-0.02, False), (-0.3, True)):
+        folder = write_scene(tmp_path / str(native), "SIMPLE_RADIAL", [FX, CX, CY, k1], image)
+        layout = read_layout(TrainConfig(scene=folder))
+        assert all((image.camera.lens is not None) == native for image in [*layout.train, *layout.test])
+        assert all((image.lens is not None) != native for image in [*layout.train, *layout.test])
+
+
+def test_pixels_beyond_a_native_lens_are_masked(tmp_path):
+    """r (1 - 1.2 r^2) ends at 2/3 sqrt(1 / 3.6); pixels beyond that radius, and those of the mask, do not count."""
+    folder = write_scene(tmp_path, "RADIAL", [FX, CX, CY, -1.2, 0.0], Image.new("RGB", (WIDTH, HEIGHT), (200, 90, 30)))
+    mask = load(folder, "native").train[0].mask[0].numpy()
+    x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / FX, (np.arange(HEIGHT) + 0.5 - CY) / FX)
+    beyond = np.hypot(x, y) > 2 / 3 * math.sqrt(1 / 3.6)
+    assert beyond.any() and (mask == np.where(beyond, 0, 255)).all()
+    half_mask(tmp_path)
+    both = load(folder, "native").test[0].mask[0].numpy()
+    assert not both[:, :WIDTH // 2].any() and (both[:, WIDTH // 2:] == mask[:, WIDTH // 2:]).all()
+
+
+@pytest.mark.parametrize("model, params, words", [
+    ("RADIAL", [FX, CX, CY, -1e5, 0.0], r"1.png: the lens folds the image back at 0.0\d+ pixels .* \[-100000.0, "),
+    # r (1 - 45 r^2) ends at 2/3 sqrt(1 / 135) = 0.057, of 70 pixels 4.0: less than a tenth of 72
+    ("RADIAL", [FX, CX, CY, -45.0, 0.0], "1.png: the lens folds the image back at 4 pixels"),
+    ("EQUIRECTANGULAR", [WIDTH, HEIGHT], "1.png: an image of all directions must be twice as wide .* is 96x72")])
+def test_impossible_lenses_are_named_with_their_image(tmp_path, model, params, words):
+    folder = write_scene(tmp_path, model, params, Image.new("RGB", (WIDTH, HEIGHT)))
+    for lenses in ("native", "undistort", "auto"):
+        with pytest.raises(SceneError, match=words):
+            load(folder, lenses)
+
+
+@pytest.mark.parametrize("fields, words", [
+    ({"camera_model": "fisheye", "distortion": [0.1] * 3}, "must be 0 or 1 or 2 or 4 finite numbers"),
+    ({"camera_model": "opencv", "distortion": [math.nan]}, r"distortion of a lens opencv is \[nan\]"),
+    ({"camera_model": "orthographic"}, "`camera_model` is 'orthographic'; it must be one of opencv, fisheye"),
+    ({"camera_model": "opencv", "distortion": None}, "not the cameras of a 3DGS model"),
+    ({"camera_model": "fisheye", "distortion": [-1e6]}, "folds the image back")])
+def test_wrong_lenses_of_cameras_json_are_named(tmp_path, fields, words):
+    entry = {**cameras_content([Camera("a", np.eye(3), np.zeros(3), FX, FY, CX, CY, WIDTH, HEIGHT)])[0], **fields}
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    os.makedirs(tmp_path / "point_cloud" / "iteration_1")
+    (tmp_path / "point_cloud" / "iteration_1" / "point_cloud.ply").write_text("")
+    with pytest.raises(SceneError, match=words):
+        read_layout(TrainConfig(scene=str(tmp_path)))
+
+
+def test_panoramas_of_colmap(tmp_path):
+    """Its model of all directions; the parameters are the image's size. Another size of the images is no matter."""
+    folder = write_scene(tmp_path, "EQUIRECTANGULAR", [128, 64], Image.new("RGB", (64, 32)), size=(128, 64))
+    settings = load(folder, "auto").train[0].camera.settings(torch.zeros(3), 0, "smoe")
+    assert settings.camera_model == "equirectangular" and (settings.image_width, settings.image_height) == (64, 32)
 
 
 def test_lenses_that_opencv_does_not_undistort_name_the_way(tmp_path):
@@ -191,12 +277,13 @@ def test_a_panorama_of_transforms_json(tmp_path):
 @needs_opencv
 def test_what_a_lens_would_show_twice_is_masked(tmp_path):
     """r (1 - 0.5 r^2) grows up to r = 0.816: further out the image would come back."""
-    lens = lens_of("RADIAL", False, {"k1": -0.5})
-    assert undistortion._last_radius(lens, 2.0) == pytest.approx(math.sqrt(2 / 3), abs=2 * 2 / 4096)
-    assert undistortion._last_radius(lens, 0.8) == math.inf
-    fisheye = lens_of("OPENCV_FISHEYE", True, {"k1": -0.3, "k2": 0.01})
+    radii, distorted = lens_of("RADIAL", False, {"k1": -0.5}).radii  # at steps of 0.0004 of the angle
+    assert radii[-1] == pytest.approx(math.sqrt(2 / 3), abs=0.0015)
+    assert distorted[-1] == pytest.approx(math.sqrt(2 / 3) * 2 / 3, abs=1e-5)
+    assert lens_of("RADIAL", False, {"k1": 0.1}).radii[0][-1] == pytest.approx(1e3)
+    radii, _ = lens_of("OPENCV_FISHEYE", True, {"k1": -0.3, "k2": 0.01}).radii
     highest = brentq(lambda angle: 1 - 3 * 0.3 * angle**2 + 5 * 0.01 * angle**4, 0.5, 1.4)
-    assert undistortion._last_radius(fisheye, 10.0) == pytest.approx(math.tan(highest), rel=0.01)
+    assert radii[-1] == pytest.approx(highest, abs=0.0015)
     folder = write_scene(tmp_path, "RADIAL", [FX, CX, CY, -1.2, 0.0], Image.new("RGB", (WIDTH, HEIGHT), (200, 90, 30)))
     mask = load(folder).train[0].mask[0].numpy()
     x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / FX, (np.arange(HEIGHT) + 0.5 - CY) / FX)
@@ -209,7 +296,7 @@ def test_undistorted_images_are_kept_and_made_anew_where_something_changes(tmp_p
     scene = tmp_path / "scene"
     image = bent_image("OPENCV", [0.2, 0.05, 0, 0])
     folder = write_scene(scene, "OPENCV", [FX, FY, CX, CY, 0.2, 0.05, 0, 0], image)
-    config = TrainConfig(scene=folder)
+    config = TrainConfig(scene=folder, lenses="undistort")
     first = load(folder)
     kept = sorted(os.listdir(scene / ".dsmoe_cache"))
     assert len(kept) == 2 and sum(name.startswith("mask-") for name in kept) == 1, "equal images share image and mask"
@@ -305,15 +392,17 @@ def test_files_of_the_cache_have_the_usual_rights_and_what_a_kill_left_goes(tmp_
     cache.mkdir()
     with subprocess.Popen(["true"]) as ended:
         pass
-    (cache / f"{PART}{ended.pid}-0123.png").write_bytes(b"half")
-    (cache / f"{PART}{os.getppid()}-0123.png").write_bytes(b"another process writes it")
+    half, others = (cache / f"{own_part()}{number}-0123.png" for number in (ended.pid, os.getppid()))
+    for path in (half, others):  # a living process writes the second one
+        path.write_bytes(b"half")
+        os.utime(path, (time.time() - 2 * ABANDONED,) * 2)
     before = os.umask(0o027)
     try:
         load(folder)
     finally:
         os.umask(before)
     left = [name for name in os.listdir(cache) if name.startswith(PART)]
-    assert left == [f"{PART}{os.getppid()}-0123.png"]
+    assert left == [others.name]
     assert {os.stat(cache / name).st_mode & 0o777 for name in {*os.listdir(cache)} - {*left}} == {0o640}
 
 
@@ -342,7 +431,8 @@ def test_a_scene_of_masks_and_distortion_trains(tmp_path, capsys):
     mask = load(folder, resolution=2).train[0].mask[0].numpy()
     assert mask.shape == (HEIGHT // 2, WIDTH // 2) and not mask[:, :20].any() and (mask[:, 28:] == 255).all()
     run = str(tmp_path / "run")
-    assert main(["train", folder, "-o", run, "--resolution", "2", "--iterations", "3", "--test-every", "3"]) == 0
+    assert main(["train", folder, "-o", run, "--resolution", "2", "--iterations", "3", "--test-every", "3", "--lenses",
+                 "undistort"]) == 0
     assert "4 images of camera model SIMPLE_RADIAL_FISHEYE are undistorted" in capsys.readouterr().out
     with open(os.path.join(run, "results.json"), encoding="utf-8") as file:
         row, = json.load(file)

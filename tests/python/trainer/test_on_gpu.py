@@ -90,7 +90,7 @@ def test_captured_steps_give_the_bits_of_launched_ones(config, scene, monkeypatc
     launched, captured, broken, resumed = (Trainer(config, scene) for _ in range(4))
     launched.passes._graphs = graphs.NoGraphs()
     replays = []
-    monkeypatch.setattr(graphs.Captured, "replay_draw", lambda self, *arguments, real=graphs.Captured.replay_draw: (
+    monkeypatch.setattr(graphs.Captured, "draw", lambda self, *arguments, real=graphs.Captured.draw: (
         replays.append(self), real(self, *arguments))[1])
     for trainer in (launched, captured):
         torch.manual_seed(7)

@@ -1,16 +1,20 @@
 """The direct passes of a step against those of autograd: the same training, bit for bit, whatever happens in it."""
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import random
+from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten
 
 from dsmoe.model import PARAMETERS
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
-from dsmoe.training.graphs import IDLE, MOST_KINDS, MOST_SEEN, WARM_UP, Captured, Graphs
+from dsmoe.training.graphs import IDLE, MOST_KINDS, MOST_SEEN, WARM_UP, Graphs
 from dsmoe.training.passes import AutogradPasses, DirectPasses
 from dsmoe.training.trainer import Trainer
 
@@ -33,6 +37,65 @@ class Repeats(Graphs):
             function()
 
         return replay
+
+
+class Recorded(Repeats):
+    """Graphs as CUDA's: a capture changes no memory, a replay runs the ops on it that were captured, and no Python."""
+
+    def _record(self, function):
+        recorder = Recorder()
+        with recorder:
+            function()
+        recorder.forget()
+
+        def replay():
+            self.replays += 1
+            recorder.replay()
+
+        return replay
+
+
+class Recorder(TorchDispatchMode):
+    def __init__(self):
+        super().__init__()
+        self.calls, self.before = [], {}
+
+    def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
+        for tensor in tensors_in((arguments, keywords)):
+            self.before.setdefault(id(tensor), (tensor, tensor.detach().clone()))
+        results = function(*arguments, **(keywords or {}))
+        self.calls.append((function, arguments, keywords or {}, results))
+        return results
+
+    def forget(self):
+        """Makes memory what it was in front of the capture."""
+        for tensor, value in self.before.values():
+            with versions_stay([tensor]):
+                tensor.detach().copy_(value)
+        self.before = {}
+
+    def replay(self):
+        for function, arguments, keywords, results in self.calls:
+            given = tensors_in((arguments, keywords))
+            with versions_stay(given):
+                now = function(*arguments, **keywords)
+            for old, new in zip(tensors_in(results), tensors_in(now)):
+                if all(old is not tensor for tensor in given):
+                    with versions_stay([old]):
+                        old.set_(new)  # the result that Python holds
+
+
+@contextlib.contextmanager
+def versions_stay(tensors):
+    """As of what torch does not see: the kernels of a graph."""
+    with contextlib.ExitStack() as stack:
+        for tensor in tensors:
+            stack.enter_context(torch.autograd._unsafe_preserve_version_counter(tensor))
+        yield
+
+
+def tensors_in(tree):
+    return [leaf for leaf in tree_flatten(tree)[0] if isinstance(leaf, torch.Tensor)]
 
 
 def make_direct(trainer, graphs=None):
@@ -88,7 +151,9 @@ def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
     dict(blend_mode="smoe", strategy="importance", budget=60, strategy_options="views=3,moves=0.2", iterations=50)],
     ids=str)
 @pytest.mark.parametrize("masked", [False, True])
-def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypatch, options, masked):
+@pytest.mark.parametrize("graphs", [Repeats, pytest.param(Recorded, marks=pytest.mark.skipif(
+    not hasattr(torch.autograd, "_unsafe_preserve_version_counter"), reason="this torch counts all changes"))])
+def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypatch, options, masked, graphs):
     """Whatever comes between: densifications, looks, evaluations, other losses, degrees, backgrounds and an average."""
     monkeypatch.setattr("dsmoe.training.graphs.WARM_UP", 3)
     monkeypatch.setattr("diff_smoe_rasterization.lazy_adam._CAPACITY", 7)
@@ -97,8 +162,8 @@ def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypa
         views = [dataclasses.replace(view, mask=mask if index % 3 else None) for index, view in enumerate(scene.train)]
         scene = dataclasses.replace(scene, train=views)
     config = tiny_config.changed(**options)
-    repeats = Repeats()
-    trainers, reports = [trained(config, scene, True, 0, graphs) for graphs in (None, repeats)], []
+    repeats = graphs()
+    trainers, reports = [trained(config, scene, True, 0, captures) for captures in (None, repeats)], []
     if config.strategy != "mcmc":  # whose regulariser the two kinds of passes round otherwise
         trainers.append(trained(config, scene, False, 0))
     for trainer in trainers:
@@ -123,13 +188,13 @@ class Counted(Graphs):
 
     def _new(self, num_gaussians, capture):
         self.captures.append(self.kind_now)
-        return Captured(self._record)
+        return SimpleNamespace(used=0)
 
     def run(self, memory, kinds):
         """Returns of each step whether it was a replay; the step of a capture is one."""
         replayed = []
         for self.kind_now in kinds:
-            replayed.append(self.find(memory, self.kind_now, lambda _: None) is not None)
+            replayed.append(self._find(memory, self.kind_now, lambda: None) is not None)
         return replayed
 
 
@@ -176,16 +241,16 @@ class Starved(Repeats):
 
     def __init__(self, failures, too_many, words="CUDA out of memory. Tried to allocate 2.00 GiB"):
         super().__init__()
-        self.failures, self.too_many, self.words, self.parts, self.attempts = failures, too_many, words, 0, []
+        self.failures, self.too_many, self.words, self.recorded, self.attempts = failures, too_many, words, 0, []
 
     def _new(self, num_gaussians, capture):
-        self.parts = 0
+        self.recorded = 0
         self.attempts.append(num_gaussians)
         return super()._new(num_gaussians, capture)
 
     def _record(self, function):
-        self.parts += 1
-        if self.parts == 2 and (self.failures > 0 or self.attempts[-1] >= self.too_many):
+        self.recorded += 1
+        if self.recorded == 2 and (self.failures > 0 or self.attempts[-1] >= self.too_many):
             self.failures -= 1
             raise RuntimeError(self.words)
         return super()._record(function)
@@ -255,7 +320,8 @@ def test_what_a_strategy_adds_reaches_all_gaussians(tiny_config, scene, monkeypa
     """By both passes alike, seen or not; a sum in another order is rounded otherwise."""
     monkeypatch.setattr("dsmoe.training.mcmc_strategy.NOISE_RATE", 0)
     config = tiny_config.changed(strategy="mcmc", budget=100)
-    dense, direct = (trained(config, scene, direct, 3) for direct in (False, True))
-    assert (direct.passes._radii == 0).any(), "all were seen"
+    dense, direct = (trained(config, scene, direct, 2) for direct in (False, True))
+    dense.step()
+    assert (direct.step().rendering.radii == 0).any(), "all were seen"
     for name in PARAMETERS:
         torch.testing.assert_close(direct.model.raw[name], dense.model.raw[name], rtol=1e-5, atol=1e-5)

@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def test_photographs_of_bonsai_find_their_places(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "10 photographs of one camera" in text and "comparing all 45 pairs" in text
     assert "\n10 of 10 photographs are placed; " in text and "mean reprojection error 0." in text
-    assert text.splitlines()[-1].endswith(f"train {scene} -o MODEL --iterations 3000 --scale-recipe --resolution 2")
+    assert text.splitlines()[-1].endswith(f"train {scene} -o MODEL --fast --resolution 2")
     given, found = poses_of(bonsai), {name[len("walk/"):]: pose for name, pose in poses_of(str(scene)).items()}
     assert sorted(found) == names
     theirs, ours = (np.stack([poses[name][1] for name in names]) for poses in (given, found))
@@ -232,3 +233,82 @@ def test_photographs_are_of_one_camera_if_size_and_focal_length_say_so(tmp_path)
     save("d.jpg", size=(6, 8), focal=24.0)
     assert [photos._are_of_one_camera(str(tmp_path), names) for names in (
         ["a.jpg", "b.jpg"], ["a.jpg", "c.jpg"], ["a.jpg", "d.jpg"])] == [True, False, False]
+
+
+class FakeModel:
+    """What `make_scene` asks of COLMAP's model, whose files are those of a folder."""
+
+    def __init__(self, names):
+        self.images = {index: SimpleNamespace(name=name) for index, name in enumerate(names)}
+
+    def reg_image_ids(self):
+        return [*self.images]
+
+    def num_points3D(self):
+        return 4
+
+    def compute_mean_reprojection_error(self):
+        return 0.5
+
+
+def scene_of_fake(monkeypatch, tmp_path, k1, *words):
+    """Runs `dsmoe scene` where COLMAP's part found a lens of this k1 in two of three photographs; returns the scene."""
+    pictures, scene = tmp_path / "photos", tmp_path / "scene"
+    os.makedirs(pictures / "walk", exist_ok=True)
+    for index in range(3):
+        Image.new("RGB", (80, 60), (9 * index, 9, 9)).save(pictures / "walk" / f"{index}.png")
+    names = ["walk/0.png", "walk/2.png"]
+
+    def placed(pycolmap, photographs, found, work, *rest):
+        cameras = {1: io.ColmapCamera(1, "OPENCV", 80, 60, np.array([60.0, 60, 40, 30, k1, 0, 0, 0]))}
+        images = [io.ColmapImage(index + 1, name, 1, np.array([1.0, 0, 0, 0]), np.zeros(3))
+                  for index, name in enumerate(names)]
+        shutil.rmtree(os.path.join(work, "best"), ignore_errors=True)
+        io.write_colmap(os.path.join(work, "best"), io.ColmapModel(
+            cameras, images, io.Points(np.random.RandomState(0).normal(0, 1, (4, 3)), np.zeros((4, 3), np.uint8))))
+        return FakeModel(names)
+
+    def undistort_images(made, found, photographs, cancellation_token):
+        shutil.copytree(found, os.path.join(made, "sparse"))
+        os.makedirs(os.path.join(made, "images", "walk"))
+        for name in names:
+            Image.new("RGB", (78, 58)).save(os.path.join(made, "images", name))
+
+    monkeypatch.setattr(photos, "_placed", placed)
+    monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace(
+        logging=SimpleNamespace(minloglevel=0, ERROR=SimpleNamespace(value=2)), undistort_images=undistort_images,
+        CancellationToken=SimpleNamespace))
+    assert main(["scene", str(pictures), "-o", str(scene), "--quiet", *words]) == 0
+    return pictures, scene
+
+
+@pytest.mark.parametrize("k1, words, kept, options", [
+    (-0.3, [], True, ""), (-0.02, [], False, ""), (-0.02, ["--lenses", "native"], True, " --lenses native"),
+    (0.3, ["--lenses", "native"], True, " --lenses native"), (-0.3, ["--lenses", "undistort"], False, "")])
+def test_a_strong_lens_is_kept(tmp_path, monkeypatch, capsys, k1, words, kept, options):
+    """The photographs as they are and the lens that was found, which `dsmoe train` then keeps by the line printed."""
+    pictures, scene = scene_of_fake(monkeypatch, tmp_path, k1, *words)
+    text = capsys.readouterr().out
+    assert ("keeping the lens; without it " in text) == kept and ("undistorting" in text) != kept
+    assert text.splitlines()[-1].endswith(options) and text.count("--lenses") == bool(options)
+    assert "2 of 3 photographs are placed (left out: walk/1.png)" in text
+    for name in ("walk/0.png", "walk/2.png"):
+        same = (scene / "images" / name).read_bytes() == (pictures / name).read_bytes()
+        assert same == kept
+    assert not (scene / "images" / "walk" / "1.png").exists()
+    if kept:
+        config = TrainConfig(scene=str(scene), lenses="native" if options else "auto", test_every=0)
+        camera = load_scene(config, progress=False).train[0].camera
+        assert camera.lens.camera_model == "opencv" and camera.lens.coefficients[0] == k1
+        scene_of_fake(monkeypatch, tmp_path, k1, "--lenses", "undistort")
+        assert (scene / "images" / "walk" / "0.png").read_bytes() != (pictures / "walk" / "0.png").read_bytes()
+
+
+def test_a_photograph_that_training_cannot_read_is_named(tmp_path, monkeypatch, capsys):
+    os.makedirs(tmp_path / "photos" / "walk")
+    Image.fromarray(np.zeros((60, 80), np.uint16)).save(tmp_path / "photos" / "walk" / "3.png")
+    with monkeypatch.context() as patch:
+        scene_of_fake(patch, tmp_path, -0.3)
+    with pytest.raises(SceneError, match="walk/3.png: cannot be kept as it is .* 8 bits.*; or take --lenses undistort"):
+        photos._keep(str(tmp_path / "photos"), ["walk/3.png"], str(tmp_path / "scene" / "colmap" / "best"),
+                     str(tmp_path / "made"))

@@ -10,6 +10,8 @@ from test_scene_loading import nerf_folder  # noqa: F401
 from dsmoe.cli import main
 from dsmoe.options.config import TrainConfig
 from dsmoe.options.presets import NUMBERS, Numbers, chosen_for_scene, with_preset
+from dsmoe.scenes import scene
+from dsmoe.scenes.scene import read_layout
 
 
 @pytest.mark.parametrize("words, budget, iterations, until, settings", [
@@ -81,20 +83,22 @@ def test_without_options_importance_takes_a_number_that_the_scene_says(tiny_scen
 
 @pytest.mark.parametrize("words, reached", [(["--fast", "--iterations", "60"], 144 * 2**3),
                                             (["--iterations", "4"], 144)])
-def test_a_chosen_number_is_one_that_growth_reaches(tiny_scene, tmp_path, words, reached):
+def test_a_chosen_number_is_one_that_growth_reaches(tiny_scene, tmp_path, monkeypatch, words, reached):
     """144 points; the least is 10,000. With 60 iterations growth ends before 11, and may double at 3, 6 and 9.
 
-    4 iterations have no time to grow.
+    4 iterations have no time to grow. The scene's points are read once for that and for the training.
     """
-    output = str(tmp_path / "out")
+    output, read, reader = str(tmp_path / "out"), [], scene.read_colmap_layout
+    monkeypatch.setattr(scene, "read_colmap_layout", lambda *given: read.append(1) or reader(*given))
     assert main(["train", tiny_scene, "-o", output, *words, "--quiet"]) == 0
+    assert len(read) == 1
     assert TrainConfig.load(output).budget == reached
 
 
 def test_a_number_does_not_follow_random_points(nerf_folder):
     def chosen(**options):
         config = TrainConfig(scene=nerf_folder, strategy="importance", blend_mode="smoe", **options)
-        return chosen_for_scene(config, options)
+        return chosen_for_scene(config, options, read_layout(config))
 
     assert chosen() == chosen(init_points=50_000) == {"budget": NUMBERS["cpu"].without_points}
     assert chosen(device="cuda")["budget"] == NUMBERS["cuda"].without_points
@@ -104,6 +108,7 @@ def test_a_number_does_not_follow_random_points(nerf_folder):
 def test_as_many_points_are_taken_as_time_allows(tiny_scene, monkeypatch):
     monkeypatch.setitem(NUMBERS, "cpu", Numbers(2, 10, 1000, 20, 60))
     config = TrainConfig(scene=tiny_scene, strategy="importance", blend_mode="smoe")
-    assert chosen_for_scene(config, ()) == {"init_points": 60, "budget": 120}
+    layout = read_layout(config)
+    assert chosen_for_scene(config, (), layout) == {"init_points": 60, "budget": 120}
     given = dataclasses.replace(config, init_points=70)
-    assert chosen_for_scene(given, ("init_points",)) == {"budget": 140}
+    assert chosen_for_scene(given, ("init_points",), layout) == {"budget": 140}

@@ -329,7 +329,8 @@ def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, mon
 
 def test_other_options_cannot_be_resumed(tiny_config):
     train(tiny_config, progress=False)
-    with pytest.raises(TrainerError, match=r"--seed is 0, not 1\. `--resume -o .*/out` alone keeps the run's options"):
+    words = r"--seed is 0, not 1\. `dsmoe train --resume -o .*/out` keeps the run's options"
+    with pytest.raises(TrainerError, match=words):
         train(dataclasses.replace(tiny_config, seed=1), resume=True, progress=False)
     with pytest.raises(TrainerError, match="--blend-mode"):
         train(tiny_config.changed(blend_mode="alpha"), resume=True, progress=False)
@@ -697,19 +698,28 @@ def test_an_error_of_an_unfinished_file_names_the_file(tmp_path):
 def test_no_unfinished_file_is_written_through_a_link(tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("mine")
-    os.symlink(precious, tmp_path / f"{files.PART}{os.getpid()}-file")
+    os.symlink(precious, tmp_path / f"{files.own_part()}{os.getpid()}-file")
     files.write_text_atomically(str(tmp_path / "file"), "new")
     assert precious.read_text() == "mine" and (tmp_path / "file").read_text() == "new"
     assert sorted(os.listdir(tmp_path)) == ["file", "precious"]
 
 
 def test_processes_do_not_share_an_unfinished_file_and_what_a_killed_one_left_goes(tmp_path, monkeypatch):
-    """A file FILE.part may be the user's."""
+    """A file FILE.part may be the user's. On a network folder another host may be writing under any number."""
     with subprocess.Popen(["true"]) as ended:
         pass
-    path, left, others = str(tmp_path / "file"), tmp_path / f"{files.PART}{ended.pid}-file", tmp_path / "file.part"
-    left.write_text("half")
+    path, others = str(tmp_path / "file"), tmp_path / "file.part"
+    left = tmp_path / f"{files.own_part()}{ended.pid}-file"
     others.write_text("the user's")
+    with monkeypatch.context() as patch:
+        patch.setattr(files.socket, "gethostname", lambda: "another")
+        of_another = tmp_path / f"{files.own_part()}{ended.pid}-file"
+    for file in (left, of_another):
+        file.write_text("half")
+    files.write_text_atomically(path, "mine")
+    assert left.exists(), "it is not old: another container with this host's name may be writing it"
+    for file in (left, of_another):
+        os.utime(file, (0, 0))
     with files.new_file(path) as mine:
         assert not left.exists()
         files.write_text_atomically(mine, "mine, the later one")
@@ -724,7 +734,7 @@ def test_processes_do_not_share_an_unfinished_file_and_what_a_killed_one_left_go
         files.write_text_atomically(mine, "mine")
         files.write_text_atomically(path, "the other's, which is first")
     assert (tmp_path / "file").read_text() == "the other's, which is first"
-    assert sorted(os.listdir(tmp_path)) == ["file", "file.part"]
+    assert sorted(os.listdir(tmp_path)) == sorted(["file", "file.part", of_another.name])
 
 
 @pytest.mark.parametrize("what, make", [
@@ -751,7 +761,9 @@ def test_a_loss_that_is_not_finite_is_not_saved(tiny_config, monkeypatch):
 
     def diverging_step(self, *arguments):
         done = step(self, *arguments)
-        return dataclasses.replace(done, loss=done.loss * float("nan")) if self.iteration == 3 else done
+        if self.iteration == 3:
+            done.loss = done.loss * float("nan")
+        return done
 
     monkeypatch.setattr(Trainer, "step", diverging_step)
     with pytest.raises(TrainerError, match="iteration 3: the loss is nan"):

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import struct
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from dsmoe import simplify as module
 from dsmoe.cli import main
 from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import ConfigError, TrainerError
+from dsmoe.export.glb import glb_bytes
 from dsmoe.inspection import open_renderer
 from dsmoe.model import GaussianModel
 from dsmoe.options.config import TrainConfig
@@ -25,9 +27,10 @@ from dsmoe.results.evaluation import evaluate
 from dsmoe.results.metrics import quantised
 from dsmoe.results.modelfile import load_model, model_path, raw_of
 from dsmoe.scenes.colmap import read_colmap_layout
+from dsmoe.scenes.lens import Lens
 from dsmoe.scenes.scene import load_scene, read_layout
 from dsmoe.simplify import simplify
-from dsmoe.starting import blend_options, find_model, read_start, start_renderer
+from dsmoe.starting import blend_options, check_start, find_model, read_start, start_renderer
 from dsmoe.train import train
 from dsmoe.training.forecast import Forecast
 from dsmoe.training.importance_strategy import ImportanceStrategy
@@ -90,6 +93,7 @@ def test_a_run_becomes_one_of_fewer_gaussians(run, tmp_path, capsys):
         assert row["start"][name] == pytest.approx(trained[name], rel=1e-6)
     assert row["protocol"]["resolution"] == 30 and row["protocol"]["init"] == "point_cloud.ply"
     assert f"{trained['num_gaussians']:,} Gaussians of SH degree 1, blend mode alpha" in said
+    assert f"export {output} -o model.spz" in said
     assert open(ply_of(run), "rb").read() == before, "the model itself stays"
 
 
@@ -112,6 +116,9 @@ def test_removals_begin_at_once_and_nothing_grows(run):
     scene = load_scene(config, progress=False)
     assert Forecast(config, scene).text(10, 2000.0) == (
         "at this speed the other 10 iterations take about 33 min, less and less as Gaussians are removed")
+    count = len(scene.points.positions)
+    for budget, words in ((count, " about 33 min"), (count + 1, "longer as Gaussians are added")):
+        assert Forecast(config.changed(budget=budget), scene).text(10, 2000.0).partition(". A GPU")[0].endswith(words)
     strategy = Trainer(config, scene).strategy
     assert isinstance(strategy, ImportanceStrategy)
     assert strategy.removals[0] == 4 and strategy.growth_ends == 0, "2 % of 200"
@@ -156,12 +163,12 @@ def test_alpha_becomes_smoe_and_a_smoe_model_keeps_its_gate(run, tmp_path, capsy
     stored = dataclasses.replace(io.read_gaussians(ply_of(config)), background_gate=0.375, comments=())
     ply = str(tmp_path / "smoe.ply")
     io.write_gaussians(ply, stored)
-    for words in (["simplify", ply, "--scene", run.scene, "--budget", "30"], ["train", run.scene, "--init", ply]):
+    for words in (["train", run.scene, "--init", ply], ["simplify", ply, "--scene", run.scene, "--budget", "30"]):
         output = str(tmp_path / words[0])
         assert main([*words, "-o", output, "--iterations", "4", "--resolution", "30", "--quiet"]) == 0
         config = TrainConfig.load(output)
         assert (config.blend_mode, config.background_gate, config.background_gate_start) == ("smoe", "learned", 0.375)
-    capsys.readouterr()
+    assert f"export {output} --bake alpha -o model.spz" in capsys.readouterr().out, "viewers of .spz blend by alpha"
     assert main(["simplify", ply, "--scene", run.scene, "--budget", "30", "-o", str(tmp_path / "no"), "--blend-mode",
                  "alpha"]) == 1
     assert "dsmoe export OUT --bake alpha" in capsys.readouterr().err
@@ -186,6 +193,7 @@ def test_without_photographs_a_model_is_its_own_teacher(run, tmp_path, capsys):
     assert (row["num_gaussians"], row["protocol"]["scene_kind"], row["protocol"]["test_views"]) == (40, "model", 1)
     said = capsys.readouterr().out
     assert "measured against renderings of the model" in said and "inf" not in said and row["start"]["psnr"] is None
+    assert "the scene that its folder names, /nowhere, is not there" in said
     assert main(["eval", output, "--device", "cpu"]) == 0, "what was trained on can be made again"
     assert main(["simplify", folder, "--loses", "1", "-o", str(tmp_path / "no")]) == 1
     assert "--loses compares with photographs" in capsys.readouterr().err and not (tmp_path / "no").exists()
@@ -209,6 +217,29 @@ def test_a_run_whose_scene_is_gone_is_its_own_teacher(run, tmp_path):
                 assert getattr(view.camera, name) == getattr(photograph.camera, name)
             assert np.allclose(view.camera.rotation, photograph.camera.rotation, atol=1e-12)
             assert np.allclose(view.camera.translation, photograph.camera.translation, atol=1e-12)
+
+
+def test_a_scene_without_its_photographs_leaves_the_models_renderings(run, tmp_path, capsys):
+    scene = str(tmp_path / "scene")
+    shutil.copytree(run.scene, scene)
+    shutil.rmtree(os.path.join(scene, "images"))
+    (tmp_path / "model").mkdir()
+    folder = model_folder(run, tmp_path / "model", f"Namespace(eval=False, source_path={scene!r})")
+    words = ["simplify", folder, "--budget", "40", "-o", str(tmp_path / "out"), "--iterations", "8", "--device", "cpu"]
+    assert main(words) == 1
+    text = capsys.readouterr().err
+    assert "no such folder of images" in text and f"--scene {folder} takes the model's renderings" in text
+    assert not (tmp_path / "out").exists() and main([*words, "--scene", folder]) == 0
+    said, row = capsys.readouterr().out, results_of(str(tmp_path / "out"))[0]
+    assert f"the training views have {row['psnr_train']:.2f} dB\n" in said and row["start"]["psnr"] is None
+
+
+def test_a_run_is_its_own_teacher_at_the_size_of_its_images_if_asked(run, tmp_path):
+    """Its cameras.json has those; dividing them again would be wrong."""
+    shutil.copytree(run.output, tmp_path / "run")
+    TrainConfig.load(run.output).changed(resolution=2, output=str(tmp_path / "run")).save(str(tmp_path / "run"))
+    row = simplify(str(tmp_path / "run"), str(tmp_path / "out"), scene=str(tmp_path / "run"), budget=40, **SHORT)
+    assert (row["protocol"]["scene_kind"], row["protocol"]["image_size"]) == ("model", [30, 22])
 
 
 def test_a_run_knows_how_its_scene_is_loaded_wherever_that_lies(run, tmp_path):
@@ -313,7 +344,7 @@ def test_the_fewest_that_lose_no_more(run, tmp_path, monkeypatch):
         def __init__(self, number):
             self.metrics, self.fps = {"psnr": 30 - 10 * (1 - number / count), "ssim": 1.0}, None
 
-    def figures(renderer, views, device, passes):
+    def figures(renderer, views, device, passes=5):
         return Measured(renderer.model.num_gaussians)
 
     def trained(config, *arguments, **options):
@@ -335,11 +366,24 @@ def test_the_fewest_that_lose_no_more(run, tmp_path, monkeypatch):
     assert tried[0] == begun, "a resumed search goes on where it was"
 
 
+def test_a_gain_on_the_training_views_is_said_as_one(run, tmp_path, monkeypatch):
+    count, said = results_of(run.output)[0]["num_gaussians"], []
+
+    def figures(renderer, views, device, passes=5):
+        psnr = 30.0 if renderer.model.num_gaussians == count else 31.25
+        return type("Measured", (), {"metrics": {"psnr": psnr, "ssim": 1.0}, "fps": None})
+
+    monkeypatch.setattr(module, "evaluate", figures)
+    simplify(run.output, str(tmp_path / "out"), loses=0.0, iterations=4, progress=False, say=said.append)
+    assert said[-1].endswith("31.25 dB on the training images, 1.25 dB more than the model")
+
+
 @pytest.mark.parametrize("options, words", [
     ({}, "give one of --budget N, --keep PART and --loses DB"),
     ({"budget": 5, "keep": 0.5}, "give one of"),
     ({"budget": 10**6}, "--budget is 1000000; it must be at most"),
     ({"budget": 3}, "--budget is 3; it must be at least 4"),
+    ({"budget": 0}, "--budget is 0; it must be at least 4"),
     ({"keep": 0.0}, "--keep is 0.0; it must be above 0 and at most 1"),
     ({"keep": 1.5}, "--keep is 1.5"),
     ({"loses": -1.0}, "--loses is -1.0; it must be at least 0"),
@@ -373,13 +417,78 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
     assert (f"2 of its {len(logits):,} Gaussians have a number that is NaN or infinite; `dsmoe export MODEL -o "
             "clean.glb`") in fails(ply, *scene)
     io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]]))
-    assert "does not show" in fails(ply, *scene) and "at least 15" in fails(ply, *scene)
+    said = fails(ply, *scene)
+    assert "does not show" in said and "at least 15. Is it another scene, are its poses" in said
+    assert said.endswith(", or was its background white (--white-background)?\n")
+    assert "was its background black (now it is white)?" in fails(ply, *scene, "--white-background")
+    io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]], blend_mode=None,
+                                                comments=()))
+    assert fails(ply, *scene).endswith(", or is it of another blend than alpha, which the file does not record?\n")
+    (tmp_path / "model.ksplat").write_bytes(bytes(64))
+    assert "model.ksplat: it is none of .ply, .splat, .spz and .glb" in fails(str(tmp_path / "model.ksplat"), *scene)
+    packed = "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 1\n{packed}end_header\n"
+    (tmp_path / "packed.ply").write_bytes(header.encode() + bytes(16))
+    assert "it is compressed, as SuperSplat does" in fails(str(tmp_path / "packed.ply"), *scene)
+    (tmp_path / "m.glb").write_bytes(b"glTF")
+    assert main(["export", str(tmp_path / "m.glb"), "-o", output + ".ply"]) == 1
+    assert "other commands a .ply" in capsys.readouterr().err
     main(["simplify", ply, "--budget", "40", "-o", output])
     assert "neither photographs nor cameras are known; name its scene with --scene" in capsys.readouterr().err
     (tmp_path / "bare").mkdir()
     bare = model_folder(run, tmp_path / "bare", cameras=False)
     main(["simplify", bare, "--budget", "40", "-o", output])
     assert "neither photographs nor cameras are known" in capsys.readouterr().err and not os.path.exists(output)
+
+
+@pytest.mark.parametrize("kind, order", [("float", "little"), ("double", "little"), ("float", "big")])
+def test_a_ply_of_another_program_is_read_by_the_names_of_its_fields(run, tmp_path, kind, order):
+    """No normals, fields in another order, other fields between them, either byte order, either precision."""
+    stored = io.read_gaussians(ply_of(run))
+    count, coefficients = stored.shs.shape[:2]
+    columns = {f"rot_{i}": stored.rotations[:, i] for i in range(4)}
+    columns.update({f"f_rest_{channel * coefficients + k}": stored.shs[:, k, channel]  # channel by channel
+                    for channel in range(3) for k in range(coefficients)})
+    columns.update(label=np.arange(count), opacity=stored.opacity_logits[:, 0])
+    columns.update({f"scale_{i}": stored.log_scales[:, i] for i in range(3)})
+    columns.update({f"f_dc_{i}": stored.dc[:, 0, i] for i in range(3)})
+    columns.update(zip("zxy", stored.means3D[:, [2, 0, 1]].T))
+    path = tmp_path / "model.ply"
+    header = "".join(f"property {kind} {name}\n" for name in columns)
+    dtype = (">" if order == "big" else "<") + ("f8" if kind == "double" else "f4")
+    path.write_bytes(f"ply\nformat binary_{order}_endian 1.0\nelement vertex {count}\n{header}end_header\n".encode()
+                     + np.stack(list(columns.values()), axis=1).astype(dtype).tobytes())
+    start = read_start(str(path))
+    assert (start.blend_mode, start.gaussians.sh_degree) == ("alpha", 1)
+    for name in ("means3D", "dc", "shs", "opacity_logits", "log_scales", "rotations"):
+        np.testing.assert_array_equal(getattr(start.gaussians, name), getattr(stored, name), err_msg=name)
+
+
+def test_a_model_trained_on_all_images_is_judged_by_these(run, tmp_path, capsys):
+    """As the recipe of 3DGS trains where nobody says --eval: then there is no test image."""
+    folder = model_folder(run, tmp_path, f"Namespace(eval=False, resolution=30, source_path={run.scene!r})")
+    output = str(tmp_path / "out")
+    assert main(["simplify", folder, "--keep", "1", "--iterations", "8", "-o", output, "--device", "cpu"]) == 0
+    row = results_of(output)[0]
+    scene = load_scene(run.changed(test_every=0), progress=False)
+    renderer = open_renderer(run, ply_of(run), None, "cpu")
+    before = evaluate(renderer, scene.train, "cpu", passes=1).metrics["psnr"]
+    assert row["psnr"] is None and row["start"]["psnr_train"] == pytest.approx(before, abs=1e-6)
+    assert f"the training views have {row['psnr_train']:.2f} dB, and {before:.2f} dB before" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("lens, note, question", [
+    (True, "", "were its images undistorted (--lenses undistort)"),
+    (False, "8 images are undistorted", "was it trained on images as they are (--lenses native)")])
+def test_another_lens_is_asked_for(run, lens, note, question):
+    config = run.changed(init=ply_of(run))
+    scene = load_scene(config, progress=False)
+    bent = Lens("OPENCV_FISHEYE", True, (0.0,) * 4) if lens else None
+    black = [dataclasses.replace(view, image=255 - view.image, camera=dataclasses.replace(view.camera, lens=bent))
+             for view in scene.train]
+    with pytest.raises(TrainerError) as error:
+        check_start(dataclasses.replace(scene, train=black, note=note), config)
+    assert question in str(error.value)
 
 
 def test_training_and_test_views_may_share_names(run, tmp_path):
@@ -434,7 +543,9 @@ def test_ctrl_c_keeps_the_model_and_resume_ends_where_it_would_have(run, tmp_pat
     assert 40 < len(io.read_gaussians(tmp_path / "sofar.ply").means3D), "the checkpoint's"
     assert main([*words, "-o", broken, "--resume"]) == 0
     assert open(model_path(broken, 40), "rb").read() == open(model_path(straight, 40), "rb").read()
-    assert "start" in results_of(broken)[0]
+    start = results_of(broken)[0]["start"]
+    assert main(["train", "--resume", "-o", broken, "--iterations", "44", "--quiet"]) == 0
+    assert results_of(broken)[0]["start"] == start and results_of(broken)[0]["protocol"]["iterations"] == 44
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -532,3 +643,29 @@ def test_what_is_no_glb_of_gaussians_is_named(tmp_path):
             file.write(content)
         with pytest.raises(TrainerError, match="m.glb: "):
             read_start(path)
+
+
+@pytest.mark.parametrize("place, value, words", [
+    (("accessors", 2, "count"), 5, "KHR_gaussian_splatting:SCALE has 5 rows of 3 numbers; it must have 6 of 3"),
+    (("accessors", 2, "count"), -1, "accessor 2 has -1 rows of 3 numbers from byte 168 on"),
+    (("accessors", 2, "count"), 99, "bytes of them (truncated file?)"),
+    (("meshes", 0, "primitives", 0, "attributes", "KHR_gaussian_splatting:SCALE"), 1, "SCALE has 6 rows of 4 numbers"),
+])
+def test_a_glb_whose_attributes_do_not_fit_is_told(tmp_path, place, value, words):
+    """The scales are the third accessor, behind positions and rotations: 6 (3 + 4) numbers of 4 bytes."""
+    rows = np.ones((6, 4), np.float32)
+    content = glb_bytes(io.Gaussians(means3D=rows[:, :3], dc=rows[:, None, :3], shs=np.zeros((6, 0, 3), np.float32),
+                                     opacity_logits=rows[:, :1], log_scales=rows[:, :3], rotations=rows), None)
+    begin = content.index(b"BIN\0") - 4
+    document = json.loads(content[20:begin])
+    part = document
+    for name in place[:-1]:
+        part = part[name]
+    part[place[-1]] = value
+    text = json.dumps(document).encode()
+    path = str(tmp_path / "m.glb")
+    with open(path, "wb") as file:
+        file.write(content[:12] + struct.pack("<I4s", len(text), b"JSON") + text + content[begin:])
+    with pytest.raises(TrainerError) as error:
+        read_start(path)
+    assert words in str(error.value)

@@ -55,7 +55,7 @@ def observed_step(context, iteration, gradients, radii=None):
     values = torch.tensor(gradients)
     by_place = torch.stack([0.6 * values, -0.8 * values, torch.full_like(values, 99.0)], dim=1)
     radii = torch.ones(len(gradients), dtype=torch.int32) if radii is None else torch.tensor(radii, dtype=torch.int32)
-    step = Step(iteration, 1, torch.zeros(()), lambda name, number: None)
+    step = Step(iteration, 1, torch.zeros(()))
     step.seen.append((by_place, radii))
     return step
 

@@ -11,8 +11,8 @@ namespace {
 
 constexpr int kWarps = kAdamBlock / kWarp;
 
-// The lanes that take a row together, and how many numbers each holds at a time. All of a row miss the same steps, so
-// that lanes wait for each other only where the rows of a warp differ; and 48 numbers are a row of spherical harmonics.
+// The lanes that take a row together, and how many numbers each holds at a time: 48, a row of spherical harmonics. The
+// numbers of a row miss the same steps, so lanes wait for each other only if the rows of a warp differ.
 constexpr int kRowLanes = 16;
 constexpr int kRowNumbers = 3;
 

@@ -225,9 +225,9 @@ template <class Backend, class Ops> void adam_ops(Ops& ops) {
   ops.template add<&lazy_adam_step<Backend>>(
       "lazy_adam_step(Tensor(a!) marks, Tensor(b!) rates, int steps, float[] new_rates, float[] root_scales, Tensor "
       "radii, Tensor? given_steps=None, Tensor? given_rates=None) -> ()");
-  // One step of Adam, in place, on raw means, opacities, scales and rotations, from the gradients by what `activate`
-  // makes of them in the rows whose radii [N] are above 0. values: what it made of the last three; written anew.
-  // given_rates [4, 2]: on the device, in place of the numbers.
+  // One step of Adam, in place, on raw means, opacities, scales and rotations. Gradients are by the activated values,
+  // and are read in rows whose radii [N] are above 0. values: the last three activated; written anew. given_rates [4,
+  // 2]: on the device, in place of the numbers.
   ops.template add<&gaussian_adam<Backend>>(
       "gaussian_adam(Tensor(a!)[] raw, Tensor(b!)[] values, Tensor[] dL_dvalues, Tensor(c!)[] moments, Tensor(d!)[] "
       "squares, Tensor radii, float[] rates, float[] root_scales, float beta1, float beta2, float epsilon, Tensor? "

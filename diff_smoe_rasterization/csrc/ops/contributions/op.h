@@ -29,7 +29,7 @@ template <class Backend> void contributions(Arguments& arguments) {
         Backend::template walked<S>(expect, radii, saved, blend_config<S>(background_gate, options), options);
     const ContributionMap<S> arguments = {data<S>(map), sums};
     TensorMemory memory(map);
-    Backend::contributions(own, arguments, Call{options, memory, nullptr});
+    DSMOE_WALK(Backend, contributions, own, arguments, options, memory);
   });
   arguments.give_back(weights, pixels, blend_weights, distances);
 }

@@ -25,7 +25,7 @@ template <class Backend> void gate_map(Arguments& arguments) {
     auto own = Backend::template walked<S>(expect, radii, saved, blend_config<S>(background_gate, options), options);
     set_sums(own.saved, Backend::saved_sizes(own, options), mutable_data<S>(gate_sum));
     TensorMemory memory(radii);
-    Backend::gate_map(own, map, Call{options, memory, nullptr});
+    DSMOE_WALK(Backend, gate_map, own, map, options, memory);
   });
   arguments.give_back(gaussians, counts, medians);
 }

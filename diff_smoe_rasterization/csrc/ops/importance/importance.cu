@@ -274,7 +274,7 @@ __global__ void __launch_bounds__(kWalkBlock,
 }  // namespace
 
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map, const Work& work) {
-  refuse_importance("cuda::importance", frame, map);
+  refuse_importance("cuda::importance", frame, ImportancePass<S>{map});
   const int64_t num_gaussians = frame.inputs.num_gaussians;
   const int width = frame.camera.width, height = frame.camera.height;
   if (num_gaussians == 0) return;

@@ -42,7 +42,7 @@ template <class Backend> void importance(Arguments& arguments) {
     auto own = Backend::template frame_of_rendering<S>(radii, config, options);
     Backend::take_saved(own, expect, saved, mutable_data<S>(gate_sum), options);
     TensorMemory memory(gate_sum);
-    Backend::importance(own, map, Call{options, memory, nullptr});
+    DSMOE_WALK(Backend, importance, own, map, options, memory);
   });
   arguments.give_back(shares, squared_shares, removal_costs);
 }

@@ -30,9 +30,11 @@ struct BatchArguments {
     check_arguments(function, inputs, options);
     const auto type = inputs[kMeans3D].scalar_type();
     DSMOE_CHECK_TYPE(type == kFloat, function, ": means3D is ", dtype_name(type), "; it must be float32");
+    const Expect expect(function, "means3D", inputs[kMeans3D]);
     for (int64_t v = 0; v < num_views(); ++v) {
       take_view(function, v);
       check_arguments(function, inputs, options);
+      expect("viewmatrix_end", cameras[v * kTensorsOfCamera + kViewMatrixEnd - kViewMatrix], {4, 4});
     }
     return inputs[kMeans3D].device();
   }
@@ -43,7 +45,9 @@ struct BatchArguments {
     for (int64_t v = 0; v < num_views(); ++v) {
       take_view(function, v);
       inputs = checked<Backend>(function, inputs, options);
-      kept.insert(kept.end(), inputs.begin() + kViewMatrix, inputs.begin() + kViewMatrix + kTensorsOfCamera);
+      for (size_t k = 0; k < kTensorsOfCamera; ++k) {
+        if (inputs[kViewMatrix + k].defined()) kept.push_back(inputs[kViewMatrix + k]);
+      }
       as_op(function, [&] {
         const auto frame = Backend::template frame_of_gaussians<float>(inputs, options, Images());
         batch.inputs = frame.inputs, batch.config = frame.config;
@@ -90,17 +94,20 @@ struct BatchArguments {
     options.camera_model = static_cast<int64_t>(image[4]);
     DSMOE_CHECK_VALUE(image[5] >= 0 && image[5] <= kMostLensNumbers, function, ": images says that a lens has ",
                       image[5], " numbers; it must have 0 to ", kMostLensNumbers);
-    options.lens.assign(image + 6, image + 6 + static_cast<int>(image[5]));
+    options.rolling_shutter = static_cast<int64_t>(image[6]);
+    if (options.rolling_shutter == 0) inputs[kViewMatrixEnd] = Tensor();
+    options.lens.assign(image + 7, image + 7 + static_cast<int>(image[5]));
   }
 
-  static constexpr size_t kTensorsOfCamera = 3;
+  static constexpr size_t kTensorsOfCamera = 4;
   Inputs inputs;
   Options options;
   Tensors cameras;
   std::vector<double> images;
   Tensors kept;  // what the batch points to
 };
-static_assert(kProjMatrix == kViewMatrix + 1 && kCampos == kViewMatrix + 2, "a camera's tensors lie side by side");
+static_assert(kProjMatrix == kViewMatrix + 1 && kCampos == kViewMatrix + 2 && kViewMatrixEnd == kViewMatrix + 3,
+              "a camera's tensors lie side by side");
 
 template <class Backend> void count_rows(Arguments& arguments) {
   const char* function = "count_rows";
@@ -167,9 +174,10 @@ template <class Backend> void project_rows_backward(Arguments& arguments) {
 }
 
 template <class Backend, class Ops> void view_rows_ops(Ops& ops) {
-  // The arguments are those of the first view, V cameras (viewmatrix, projmatrix and campos of each), and images:
-  // kNumbersOfImage of each: width, height, tanfovx, tanfovy, camera_model, how many numbers its lens has, and these,
-  // filled up with anything. float32.
+  // The arguments are those of the first view, V cameras (viewmatrix, projmatrix, campos and viewmatrix_end of each,
+  // the last any matrix if its shutter does not roll), and images: kNumbersOfImage of each: width, height, tanfovx,
+  // tanfovy, camera_model, how many numbers its lens has, rolling_shutter, and the lens's numbers, filled up with
+  // anything. float32.
   const std::string batch = inputs_in_schema() + options_in_schema() + ", Tensor[] cameras, float[] images";
   // radii [V, N] and offsets [V, blocks + 1] int32: the last offset of a view says how many rows it has.
   ops.template add<&count_rows<Backend>>("count_rows(" + batch + ") -> (Tensor radii, Tensor offsets)");

@@ -243,9 +243,9 @@ __global__ void __launch_bounds__(kViewBlock, Rows::kKnown ? kViewsBackwardBlock
 }
 
 template <class Body> void dispatch_cameras(const ViewBatch& batch, const Body& body) {
-  dispatch_camera<float>(
-      std::any_of(batch.views.begin(), batch.views.end(), [](const auto& view) { return has_lens(view.camera); }),
-      body);
+  CameraKind most = CameraKind::kPinhole;
+  for (const auto& view : batch.views) most = std::max(most, kind_of(view.camera));
+  dispatch_camera<float>(most, body);
 }
 
 // Calls launch(TypeOf<camera>, TypeOf<rows>, blocks, bytes of shared memory).

@@ -31,6 +31,20 @@ DSMOE_HD void add_pair(Contribution<Real>& sum, Mask<Real> contributes, Real pix
   sum.distance = sum.distance + select(contributes, sqrt(fma(dx, dx, dy * dy)), zero);
 }
 
+// Where the sums go; written whole.
+template <class S> struct ContributionSums {
+  S* pixel_weights = nullptr;  // [N]
+  int32_t* pixels = nullptr;   // [N]
+  S* blend_weights = nullptr;  // [N]
+  S* distances = nullptr;      // [N] pixels
+};
+
+// From a map of the image to sums over the pixels of each Gaussian.
+template <class S> struct ContributionMap {
+  const S* pixel_weights = nullptr;  // [H, W]
+  ContributionSums<S> sums;
+};
+
 template <class S> struct ContributionPass {
   template <class Real> struct State {
     Real weight;  // of the pixel, in the caller's map
@@ -41,6 +55,13 @@ template <class S> struct ContributionPass {
   template <class Real> using Sums = Contribution<Real>;
   static constexpr bool kCounts = true;
 
+  template <class Visit> void arrays(Visit visit, int64_t count) const {
+    visit("pixel_weights", map.pixel_weights, "[H, W]", 1);
+    visit("sums.pixel_weights", map.sums.pixel_weights, "[N]", count);
+    visit("sums.pixels", map.sums.pixels, "[N]", count);
+    visit("sums.blend_weights", map.sums.blend_weights, "[N]", count);
+    visit("sums.distances", map.sums.distances, "[N]", count);
+  }
   SumTargets<S> targets() const {
     return {{map.sums.pixel_weights, map.sums.blend_weights, map.sums.distances}, 3, map.sums.pixels};
   }

@@ -10,6 +10,15 @@
 
 namespace dsmoe {
 
+// Per pixel; all are written whole.
+struct GateMap {
+  int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 if none is
+  int32_t* counts = nullptr;     // [H, W] how many Gaussians the numerator has
+  // [H, W] the one with which the weights, in the order of the list, reach half of the denominator; -1 where none does.
+  // Or null
+  int32_t* medians = nullptr;
+};
+
 template <class S> struct GateMapPass {
   template <class Real> struct State {
     Real greatest;       // weight so far
@@ -25,6 +34,13 @@ template <class S> struct GateMapPass {
   };
   template <class Real> using Sums = NoSums;
 
+  template <class Visit> void arrays(Visit visit, int64_t) const {
+    visit("gaussians", map.gaussians, "[H, W]", 1);
+    visit("counts", map.counts, "[H, W]", 1);
+    const bool median = map.medians != nullptr;
+    visit("saved.gate_sum", gate_sum, "[H, W]", median);
+    visit("saved.tails", saved_tails, "[H, W]", median && has_tails(blend.mode));
+  }
   template <BlendMode kMode> DSMOE_HD State<S> begin(int64_t pixel) const {
     State<S> state = {};
     if (map.medians == nullptr) return state;

@@ -5,6 +5,7 @@
 
 #include "dsmoe/hd.h"
 #include "dsmoe/training/adam.h"
+#include "dsmoe/vec.h"
 
 namespace dsmoe {
 
@@ -107,7 +108,7 @@ template <class S> struct GateStep {
   S* moment;          // [1] mean gradient
   S* square;          // [1] mean squared gradient
   S* gate;            // [1] lambda, written
-  const S* gradient;  // [1] by lambda
+  const S* gradient;  // [1] by lambda; one that is not finite, as of a scaled loss that overflowed, counts as 0
   S bound;
   S limit;  // of |p|
   AdamConstants<S> constants;
@@ -115,7 +116,8 @@ template <class S> struct GateStep {
 
   DSMOE_HD void operator()(int64_t) const {
     S p = *logarithm;
-    adam_step(constants, rates, *gradient * exp(p), p, *moment, *square);
+    const S by_gate = is_finite(*gradient) ? *gradient : S(0);
+    adam_step(constants, rates, by_gate * exp(p), p, *moment, *square);
     p = p < -limit ? -limit : p > limit ? limit : p;
     *logarithm = p;
     *gate = exp(p) + bound;
