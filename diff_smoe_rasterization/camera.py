@@ -6,8 +6,7 @@ from typing import Any, Optional, Sequence, Tuple
 
 import torch
 
-from .settings import (GaussianRasterizationSettings, numbers_of, resolve_blend_mode, resolve_lens,
-                       resolve_shutter)
+from .settings import GaussianRasterizationSettings, numbers_of, resolve_blend_mode, resolve_lens, resolve_shutter
 
 # Clip range of the projection matrix. Nothing reads clip z (culling uses view depth), so it only has to be finite.
 CLIP_NEAR = 0.01

@@ -302,7 +302,8 @@ def _scene(arguments: argparse.Namespace) -> None:
 
     device = device_to_train_on()
     made = make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
-                      not arguments.quiet, say=lambda text: print(text, flush=True), lenses=arguments.lenses)
+                      not arguments.quiet, say=lambda text: print(text, flush=True), lenses=arguments.lenses,
+                      fov=arguments.fov)
     print(made)
     words = [train_command(arguments.output, 'MODEL', device, *made.size), *made.options]
     print(f"to train on it: {' '.join(words)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import shutil
 import sqlite3
@@ -22,7 +23,7 @@ from .options.choices import CAMERA_MODEL, LENSES, MATCHING, MOST_EXHAUSTIVE
 from .options.early import FROM_VIDEO, VIDEO_ENDINGS, check_photos
 from .scenes.cameras import Camera
 from .scenes.images import UNREADABLE, check_depth, image_size, open_image
-from .scenes.lens import MODELS, colmap_intrinsics
+from .scenes.lens import AROUND, MODELS, colmap_intrinsics
 from .scenes.undistortion import MOST_CUT, cut_off
 from .system.files import is_file, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
@@ -38,7 +39,8 @@ ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
 MIN_PHOTOS = 3
 POLL_SECONDS = 0.5
-FISHEYE_FOCAL = 0.4  # of the longer side, where a photograph records none: 143 degrees. COLMAP's 1.2 are 48
+FISHEYE_FOV = 150.0  # degrees along the longer side, of a fisheye whose photographs record nothing
+MOST_FOV, MOST_FISHEYE_FOV = 170.0, 340.0
 FOCAL_LENGTH, EXIF = 37386, 0x8769  # tags
 ADVICE = ("Neighbouring photographs should show two thirds of the same things, sharply, with texture, from places that "
           "differ: walk around, do not only turn the camera. ")
@@ -65,12 +67,14 @@ class Made:
 
 
 def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_model: str = CAMERA_MODEL,
-               progress: bool = True, say: Callable[[str], None] = lambda text: None, lenses: str = LENSES[0]) -> Made:
+               progress: bool = True, say: Callable[[str], None] = lambda text: None, lenses: str = LENSES[0],
+               fov: Optional[float] = None) -> Made:
     """Writes a COLMAP scene of the photographs in a folder: the images, and where each was taken.
 
     matching: "exhaustive" compares all pairs, "sequential" neighbours by name, "auto" all pairs of up to
     MOST_EXHAUSTIVE. say: is called with a line before each step. lenses: "undistort" writes images of a pinhole camera,
-    "native" the photographs with the lens that COLMAP found, "auto" these where undistortion would cut off much. Raises
+    "native" the photographs with the lens that COLMAP found, "auto" these where undistortion would cut off much. fov:
+    about how many degrees a photograph shows along its longer side; None: as it records, else COLMAP's guess. Raises
     SceneError, also if the photographs do not connect, and TrainerError without pycolmap.
     """
     names = photo_names(photos, output, say)
@@ -93,7 +97,7 @@ def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_mod
         os.makedirs(work, exist_ok=True)
         write_record(output, SCENE, Record(subject, earlier.files), earlier.files)
         pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # from now on it prints only errors
-        best = _placed(pycolmap, photos, names, work, matching, camera_model, progress, say)
+        best = _placed(pycolmap, photos, names, work, matching, camera_model, fov, progress, say)
         placed = sorted(best.images[number].name for number in best.reg_image_ids())
         found, made = os.path.join(work, "best"), os.path.join(work, "made")
         cut = _cut_off(found)
@@ -170,16 +174,16 @@ def photo_names(folder: str, output: str, say: Callable[[str], None] = lambda te
 
 
 def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: str, camera_model: str,
-            progress: bool, say: Callable[[str], None]) -> Any:
+            fov: Optional[float], progress: bool, say: Callable[[str], None]) -> Any:
     """The largest model that COLMAP makes of the photographs, which it also writes to WORK/best. Raises SceneError."""
     database, count = os.path.join(work, DATABASE), len(names)
-    if _forget_others(photos, names, work, camera_model):
-        say("photographs or camera model have changed since the last time: all features are found anew")
     one_camera = _are_of_one_camera(photos, names)
+    guess = _first_guess(photos, names, camera_model, fov, one_camera)
+    if _forget_others(photos, names, work, f"{camera_model} {guess}".strip()):
+        say("photographs or camera model have changed since the last time: all features are found anew")
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
-    if "FISHEYE" in camera_model:
-        reader.default_focal_length_factor = FISHEYE_FOCAL
+    reader.camera_params = guess
     mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
     say(f"finding features in {count} photographs of {'one camera' if one_camera else 'several cameras'}, on the "
         f"{'GPU' if pycolmap.has_cuda else 'CPU'}")
@@ -219,6 +223,28 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
     os.makedirs(os.path.join(work, "best"))
     best.write(os.path.join(work, "best"))
     return best
+
+
+def _first_guess(photos: str, names: Sequence[str], camera_model: str, fov: Optional[float], one_camera: bool) -> str:
+    """The camera's parameters from which COLMAP starts; empty: as it guesses them, for 48 degrees.
+
+    Through a fisheye it places nothing without, as it compares photographs by a pinhole. Raises SceneError.
+    """
+    is_fisheye, first = "FISHEYE" in camera_model, os.path.join(photos, names[0])
+    if fov is None and not (is_fisheye and one_camera and _recorded_focal_length(first) is None):
+        return ""
+    angle, most = FISHEYE_FOV if fov is None else fov, MOST_FISHEYE_FOV if is_fisheye else MOST_FOV
+    if camera_model == AROUND or not 1 <= angle <= most:
+        allowed = f"between 1 and {most:g} degrees" if camera_model != AROUND else "left out: it is 360 degrees"
+        raise SceneError(f"--fov is {angle:g}; for --camera-model {camera_model} it must be {allowed}")
+    if not one_camera:
+        raise SceneError(f"--fov is {angle:g}, which is of one camera; the photographs in {photos} have several "
+                         "sizes or focal lengths")
+    width, height = image_size(first)
+    half = math.radians(angle) / 2
+    focal = max(width, height) / 2 / (half if is_fisheye else math.tan(half))
+    focals, _, coefficients = MODELS[camera_model]
+    return ",".join(f"{value:g}" for value in (*[focal] * focals, width / 2, height / 2, *[0] * len(coefficients)))
 
 
 def _forget_others(photos: str, names: Sequence[str], work: str, camera_model: str) -> bool:

@@ -10,6 +10,7 @@ from diff_smoe_rasterization import rasterize
 
 SIZE, GAP, BORDER = 260, 8, 22  # pixels: of a square panel, between panels, above a panel for its text
 LOW = 3 * SIZE // 4
+BONSAI = {"eye": (-2.0, 0.98, -0.4), "target": (0.4, 1.52, 1.68), "up": (0.02, -0.754, -0.656)}
 ROWS = (("pinhole", "orthographic", "opencv"), ("fisheye", "equirectangular"))
 
 
@@ -41,11 +42,12 @@ parser.add_argument("model", help="a .ply of 3DGS, or of this trainer")
 parser.add_argument("--eye", type=float, nargs=3, default=[2.7, 1.6, 0.3], help="where the camera is")
 parser.add_argument("--target", type=float, nargs=3, default=[0.0, 0.6, 0.0], help="what it looks at")
 parser.add_argument("--up", type=float, nargs=3, default=[0.0, 1.0, 0.0], help="what is up in its images")
+parser.add_argument("--bonsai", action="store_true", help="of a model of bonsai: the place of the picture in docs/")
 parser.add_argument("-o", "--output", default="lenses.jpg")
 arguments = parser.parse_args()
 
 gaussians, options = load(arguments.model)
-place = {"eye": arguments.eye, "target": arguments.target, "up": arguments.up}
+place = BONSAI if arguments.bonsai else {"eye": arguments.eye, "target": arguments.target, "up": arguments.up}
 sheet = Image.new("RGB", (3 * SIZE + 2 * GAP, LOW + SIZE + 2 * BORDER), "white")
 draw, top = ImageDraw.Draw(sheet), 0
 for names in ROWS:

@@ -82,17 +82,17 @@ class Lens:
         values = dict(zip(MODELS[THIN_PRISM][2] if self.model == THIN_PRISM else FISHEYE if self.is_fisheye
                           else PERSPECTIVE, self.coefficients))
         k = [values.get(f"k{index}", 0.0) for index in range(1, 7)]
-        if self.is_fisheye:
-            radius = np.linspace(0, FISHEYE_END, SAMPLES)
-            square, under = radius**2, np.ones(SAMPLES)
-            distorted = radius * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
-        else:
-            radius = np.tan(np.linspace(0, math.atan(MOST_SLOPE), SAMPLES))
-            square = radius**2
-            under = 1 + square * (k[3] + square * (k[4] + square * k[5]))
-            with np.errstate(divide="ignore"):
+        with np.errstate(all="ignore"):  # what is not finite ends the range
+            if self.is_fisheye:
+                radius = np.linspace(0, FISHEYE_END, SAMPLES)
+                square, under = radius**2, np.ones(SAMPLES)
+                distorted = radius * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
+            else:
+                radius = np.tan(np.linspace(0, math.atan(MOST_SLOPE), SAMPLES))
+                square = radius**2
+                under = 1 + square * (k[3] + square * (k[4] + square * k[5]))
                 distorted = radius * (1 + square * (k[0] + square * (k[1] + square * k[2]))) / under
-        falls = np.flatnonzero((np.diff(distorted) <= 0) | (under[1:] <= 0))
+            falls = np.flatnonzero(~((np.diff(distorted) > 0) & (under[1:] > 0) & np.isfinite(distorted[1:])))
         end = falls[0] + 1 if len(falls) else SAMPLES
         return radius[:end], distorted[:end]
 

@@ -201,6 +201,16 @@ def test_what_undistortion_cuts_off(focal):
     assert undistortion.cut_off(camera, lens_of("RADIAL", False, {"k1": 0.1})) == 0, "pincushion"
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e300, -1e300])
+def test_coefficients_of_any_size_have_a_finite_range(value):
+    """float64 overflows on the way."""
+    for model, names in (("FULL_OPENCV", ("k1", "k3", "k4", "k6")), ("OPENCV_FISHEYE", ("k1", "k4"))):
+        for name in names:
+            radii, distorted = lens_of(model, "FISHEYE" in model, {name: value}).radii
+            assert np.isfinite(distorted).all() and (np.diff(distorted) > 0).all() and radii[0] == 0
+
+
 def test_a_mild_lens_is_undistorted_and_a_strong_one_kept(tmp_path):
     image = Image.new("RGB", (WIDTH, HEIGHT), (9, 9, 9))
     for k1, native in ((-0.02, False), (-0.3, True)):

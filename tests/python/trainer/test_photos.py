@@ -312,3 +312,30 @@ def test_a_photograph_that_training_cannot_read_is_named(tmp_path, monkeypatch, 
     with pytest.raises(SceneError, match="walk/3.png: cannot be kept as it is .* 8 bits.*; or take --lenses undistort"):
         photos._keep(str(tmp_path / "photos"), ["walk/3.png"], str(tmp_path / "scene" / "colmap" / "best"),
                      str(tmp_path / "made"))
+
+
+def test_what_colmap_starts_from(tmp_path):
+    """Of 80 pixels across: 40 are half of 150 degrees of a fisheye, and half of 90 of any other camera."""
+    def save(name, size, focal=None):
+        exif = Image.Exif()
+        if focal:
+            exif.get_ifd(photos.EXIF)[photos.FOCAL_LENGTH] = focal
+        Image.new("RGB", size).save(tmp_path / name, exif=exif)
+
+    def guess(camera_model, fov=None, name="a.jpg", one_camera=True):
+        return photos._first_guess(str(tmp_path), [name], camera_model, fov, one_camera)
+
+    save("a.jpg", (80, 60))
+    save("b.jpg", (60, 80), focal=24.0)
+    assert guess("OPENCV") == guess("EQUIRECTANGULAR") == guess("OPENCV_FISHEYE", one_camera=False) == ""
+    assert guess("OPENCV_FISHEYE", name="b.jpg") == "", "it records one"
+    fisheye = [float(number) for number in guess("OPENCV_FISHEYE").split(",")]
+    assert fisheye == pytest.approx([40 / np.radians(75)] * 2 + [40, 30, 0, 0, 0, 0], rel=1e-5)
+    assert guess("OPENCV", 90.0) == "40,40,40,30,0,0,0,0" and guess("SIMPLE_RADIAL", 90.0, "b.jpg") == "40,30,40,0"
+    for camera_model, fov, words in (("OPENCV", 175.0, "must be between 1 and 170 degrees"),
+                                     ("OPENCV_FISHEYE", 350.0, "between 1 and 340"), ("OPENCV", np.nan, "nan; for"),
+                                     ("EQUIRECTANGULAR", 90.0, "must be left out: it is 360 degrees")):
+        with pytest.raises(SceneError, match=f"--fov is .*{words}"):
+            guess(camera_model, fov)
+    with pytest.raises(SceneError, match="--fov is 90, which is of one camera; .* several sizes or focal lengths"):
+        guess("OPENCV", 90.0, one_camera=False)
