@@ -293,12 +293,45 @@ TYPED_TEST(RasterizeIn, EveryInstanceHasItsOwnSlotAmongItsGaussians) {
   const Rendering<float> r = render(scene);
   std::vector<int> used(r.instances.size());
   for (const TileInstance& instance : r.instances) {
-    EXPECT_GE(instance.slot, r.instance_offsets[instance.gaussian]);
-    EXPECT_LT(instance.slot, r.instance_offsets[instance.gaussian + 1]);
+    EXPECT_GE(instance.slot, r.instance_offsets[instance.index()]);
+    EXPECT_LT(instance.slot, r.instance_offsets[instance.index() + 1]);
     ++used.at(instance.slot);
   }
   for (const int times : used) EXPECT_EQ(times, 1);
   EXPECT_EQ(r.tile_offsets.back(), static_cast<int64_t>(r.instances.size()));
+}
+
+// Where no pixel of a tile is wide, walks skip such instances. With all of them walked no bit changes.
+TYPED_TEST(RasterizeIn, InstancesWithoutNearPairsMatterToWidePixelsOnly) {
+  if (!Blend<TypeParam::value>::kNearFirst) return;
+  Scene<float> scene = in_mode(convert<float>(make_scene(28, 1500, 90, 70)), TypeParam::value);
+  const ImageWeights<float> weights(scene, 29);
+  for (const float below : {0.0f, kFaintBelow, 0.6f}) {
+    scene.config.blend.faint_below = below;
+    Rendering<float> marked = render(scene), all = render(scene);
+    const auto skipped = std::count_if(all.instances.begin(), all.instances.end(),
+                                       [](const TileInstance& instance) { return !instance.has_near_pairs(); });
+    EXPECT_GT(skipped, 500);
+    for (TileInstance& instance : all.instances) instance.gaussian = instance.index();
+    for (auto* image : {&all.color, &all.gate_sum, &all.final_transmittance}) {
+      std::fill(image->begin(), image->end(), -1.0f);
+    }
+    cpu::blend(frame_of(scene, all));
+    EXPECT_EQ(marked.color, all.color);
+    EXPECT_EQ(marked.gate_sum, all.gate_sum);
+    EXPECT_EQ(marked.final_transmittance, all.final_transmittance);
+    EXPECT_EQ(render_backward(scene, marked, weights.gradients()).flat(),
+              render_backward(scene, all, weights.gradients()).flat());
+  }
+}
+
+TEST(Rasterize, InstancesAreMarkedOnlyIfNearPairsAreBlendedFirst) {
+  Scene<float> scene = convert<float>(make_scene(28, 300, 70, 50));
+  BlendModes::for_each([&](auto mode) {
+    scene.config.blend.mode = mode();
+    scene.config.blend.faint_below = kFaintEverywhere;
+    for (const TileInstance& instance : render(scene).instances) ASSERT_TRUE(instance.has_near_pairs());
+  });
 }
 
 void expect_depth_order(BlendMode mode) {
@@ -310,7 +343,7 @@ void expect_depth_order(BlendMode mode) {
   int ties = 0;
   for (size_t tile = 0; tile + 1 < r.tile_offsets.size(); ++tile) {
     for (int64_t k = r.tile_offsets[tile] + 1; k < r.tile_offsets[tile + 1]; ++k) {
-      const int32_t before = r.instances[k - 1].gaussian, here = r.instances[k].gaussian;
+      const int32_t before = r.instances[k - 1].index(), here = r.instances[k].index();
       const float front = r.projected[before].depth, back = r.projected[here].depth;
       ASSERT_LE(front, back);
       if (front == back) {

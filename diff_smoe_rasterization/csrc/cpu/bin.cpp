@@ -59,7 +59,10 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
   const int64_t num_visible = static_cast<int64_t>(order.size());
 
   // A counting sort by tile. Each thread has a run of the depth order and counters of its own. So the lists are in
-  // depth order, whatever the number of threads. The tile of each instance is found once, and kept by slot.
+  // depth order, whatever the number of threads. The tile of each instance is found once, and kept by slot, with
+  // kWideOnly if near pairs are blended first and none of them may lie there.
+  constexpr uint32_t kWideOnly = uint32_t(1) << 31;
+  const bool near_first = config.blend.blends_near_first();
   const int num_runs = static_cast<int>(std::clamp<int64_t>(num_visible / 256, 1, std::max(1, config.num_threads)));
   const std::unique_ptr<uint32_t[]> tile_of_slot(new uint32_t[saved.instance_offsets[num_gaussians]]);
   std::vector<std::vector<int64_t>> cursors(num_runs, std::vector<int64_t>(tiles));
@@ -69,11 +72,15 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
   run_threads(num_runs, [&](int run) {
     for_each_gaussian(run, [&](int32_t i) {
       uint32_t* next = &tile_of_slot[saved.instance_offsets[i]];
+      FootprintTiles<S> near;
+      if (near_first) near = near_tiles(frame, i);
       for_each_tile_row(frame, i, [&](int x0, int x1, int y) {
+        typename FootprintTiles<S>::Span span = {x0, x1};
+        if (near_first) span = near.begin() <= y && y < near.end() ? near.row(y) : typename FootprintTiles<S>::Span();
         for (int x = x0; x < x1; ++x) {
           const uint32_t tile = static_cast<uint32_t>(y - band.begin) * grid.columns + x;
           ++cursors[run][tile];
-          *next++ = tile;
+          *next++ = span.x0 <= x && x < span.x1 ? tile : tile | kWideOnly;
         }
       });
     });
@@ -96,7 +103,8 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
   run_threads(num_runs, [&](int run) {
     for_each_gaussian(run, [&](int32_t i) {
       for (int64_t slot = saved.instance_offsets[i]; slot < saved.instance_offsets[i + 1]; ++slot) {
-        saved.instances[cursors[run][tile_of_slot[slot]]++] = {i, static_cast<uint32_t>(slot)};
+        const uint32_t tile = tile_of_slot[slot];
+        saved.instances[cursors[run][tile & ~kWideOnly]++] = {tile < kWideOnly ? i : ~i, static_cast<uint32_t>(slot)};
       }
     });
   });

@@ -52,6 +52,12 @@ template <class S, class Visit> void for_each_tile_row(const Frame<S>& frame, in
   for_each_tile_row(gaussian.conic, gaussian.mean, reach, bounds_in(frame, i), visit);
 }
 
+// The tiles that may hold near pairs of Gaussian i.
+template <class S> FootprintTiles<S> near_tiles(const Frame<S>& frame, int64_t i) {
+  const ProjectedGaussian<S>& gaussian = frame.saved.projected[i];
+  return {gaussian.conic, gaussian.mean, near_reach(gaussian.opacity, gaussian.squared_reach), bounds_in(frame, i)};
+}
+
 // Whether the frame has no lists.
 template <class S> bool is_banded(const Frame<S>& frame) {
   return frame.saved.instances == nullptr && frame.saved.instance_offsets[frame.inputs.num_gaussians] > 0;

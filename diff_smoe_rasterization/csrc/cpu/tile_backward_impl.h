@@ -128,7 +128,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     out[kNumGateMoments + num_features_ + 1] = sum_lanes(sums.absolute.y);
   }
 
-  DSMOE_HD void write_zeros(uint32_t slot) const {
+  DSMOE_HD void skip(uint32_t slot) const {
     S* out = record(slot);
     for (int k = 0; k < record_size(num_features_, absolute_); ++k) out[k] = S(0);
   }
@@ -163,7 +163,7 @@ int64_t blend_tile_backward(const Tile<S>& tile, const TileGradients<S>& gradien
   BackwardVisitor<S, kMode, kFeatures> visitor(num_features, scratch, gradients);
   const int64_t num_seen = visitor.read(tile, TileExtent(tile), gradients);
   const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
-  for (int64_t i = end; i < tile.end; ++i) visitor.write_zeros(tile.saved.instances[i].slot);
+  for (int64_t i = end; i < tile.end; ++i) visitor.skip(tile.saved.instances[i].slot);
   return walk_tile(tile, tile.begin, end, num_features, wide, visitor);
 }
 

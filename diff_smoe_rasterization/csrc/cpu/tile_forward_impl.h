@@ -107,12 +107,14 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
     const PixelCenters<S> pixels(extent_);
     const GaussianList<S> list(tile_, extent_, num_features_, kPairs);
     int64_t pairs = 0;
-    for (int64_t begin = tile_.begin; begin < tile_.end && open_ != 0; begin += kBatch) {
-      const int count = static_cast<int>(min<int64_t>(kBatch, tile_.end - begin));
-      for (int k = 0; k < count; ++k) {
-        list.load(begin + k, min(begin + k + kPrefetchDistance, tile_.end - 1), batch_[k]);
-        met_[k] = batch_[k].met;
-        smooth_[k] = batch_[k].smooth;
+    for (int64_t next = tile_.begin; next < tile_.end && open_ != 0;) {
+      int count = 0;
+      for (; count < kBatch && next < tile_.end; ++next) {
+        if (!list.wants(next)) continue;
+        list.load(next, min(next + kPrefetchDistance, tile_.end - 1), batch_[count]);
+        met_[count] = batch_[count].met;
+        smooth_[count] = batch_[count].smooth;
+        ++count;
       }
       for (int k = count; k < kBatch; ++k) met_[k] = smooth_[k] = 0;
       for (CellBits cells = open_; cells != 0; cells &= cells - 1) {

@@ -70,9 +70,13 @@ template <class S, BlendMode kBlendMode, class Pass> class PassVisitor {
     }
   }
 
+  DSMOE_HD void skip(uint32_t slot) const {
+    if constexpr (kSums) records_[slot] = Record();
+  }
+
   // Ends every pixel.
   DSMOE_HD void end(const Tile<S>& tile) const {
-    const auto gaussian_at = [&](int64_t i) { return tile.saved.instances[tile.begin + i].gaussian; };
+    const auto gaussian_at = [&](int64_t i) { return tile.saved.instances[tile.begin + i].index(); };
     TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
       State<S> state;
       each_array([&](PixelArray<S> array, auto& number) { number = array.pixel(x, y); }, state);
@@ -101,7 +105,7 @@ int64_t pass_of_tile(const Tile<S>& tile, const Pass& pass, Record* records, S* 
   PassVisitor<S, kMode, Pass> visitor(pass, records, scratch);
   const int64_t end = tile.begin + visitor.begin(tile);
   if constexpr (Record::kNum > 0) {
-    for (int64_t i = end; i < tile.end; ++i) records[tile.saved.instances[i].slot] = Record();
+    for (int64_t i = end; i < tile.end; ++i) visitor.skip(tile.saved.instances[i].slot);
   }
   const int64_t pairs = walk_tile(tile, tile.begin, end, 0, wide, visitor);
   if constexpr (Record::kNum == 0) visitor.end(tile);
@@ -200,6 +204,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   DSMOE_HD void end(const ListedGaussian<S>& gaussian, const Importance<P>& sum) const {
     records_[gaussian.slot] = {sum_lanes(sum.share), sum_lanes(sum.squared_share), sum_lanes(sum.removal_cost)};
   }
+  DSMOE_HD void skip(uint32_t slot) const { records_[slot] = {}; }
 
  private:
   DSMOE_HD PixelArray<S> value_of(int c) const { return {channels_.values + 2 * c * kTilePixels}; }
@@ -224,7 +229,7 @@ int64_t importance_of_tile(const Tile<S>& tile, const ImportanceMap<S>& map, Imp
   ImportanceVisitor<S, kMode, kFeatures> visitor(tile, scratch, map, records);
   const int64_t num_seen = visitor.read(tile);
   const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
-  for (int64_t i = end; i < tile.end; ++i) records[tile.saved.instances[i].slot] = {};
+  for (int64_t i = end; i < tile.end; ++i) visitor.skip(tile.saved.instances[i].slot);
   return walk_tile(tile, tile.begin, end, tile.config.num_features(), wide, visitor);
 }
 

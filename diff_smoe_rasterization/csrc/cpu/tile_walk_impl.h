@@ -136,15 +136,18 @@ template <class S> class GaussianList {
         further_reach_(pairs == Pairs::kWithTails ? tile.config.blend.tail_reach() : S(0)),
         cut_(tile.config.blend.alpha_cut()) {}
 
+  // Whether the walk wants entry i of all lists.
+  DSMOE_HD bool wants(int64_t i) const { return !near_ || tile_.saved.instances[i].has_near_pairs(); }
+
   // Fills `listed` with entry i of all lists. next: an entry that will soon be wanted; the Gaussians of a list lie
   // anywhere in memory.
   DSMOE_HD void load(int64_t i, int64_t next, ListedGaussian<S>& listed) const {
     const SavedForward<S>& saved = tile_.saved;
-    const int64_t soon = saved.instances[next].gaussian;
+    const int64_t soon = saved.instances[next].index();
     __builtin_prefetch(saved.projected + soon);
     __builtin_prefetch(saved.features + soon * num_features_);
     const TileInstance& instance = saved.instances[i];
-    const ProjectedGaussian<S>& gaussian = saved.projected[instance.gaussian];
+    const ProjectedGaussian<S>& gaussian = saved.projected[instance.index()];
     listed.mean = gaussian.mean;
     listed.exponent = ExponentFactors<S>(gaussian.conic);
     listed.opacity = gaussian.opacity;
@@ -153,7 +156,7 @@ template <class S> class GaussianList {
     if (near_) listed.least_alpha = listed.near_alpha;
     listed.position = S(i - tile_.begin);
     listed.slot = instance.slot;
-    listed.features = saved.features + static_cast<int64_t>(instance.gaussian) * num_features_;
+    listed.features = saved.features + static_cast<int64_t>(instance.index()) * num_features_;
     find_cells(gaussian, listed);
   }
 
@@ -289,6 +292,7 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
 //   wanted(at, pixels)    whether a pack's pairs are wanted, and for which pixels; at: the first in a PixelArray
 //   take(at, pairs, pixels, sums)   a pack of pairs
 //   end(gaussian, sums)
+//   skip(slot)            in place of these two for a Gaussian without pairs in the walk
 // Between `begin` and `end`, `wanted` is asked of each pack that the footprint may meet. If it says so, `take`
 // follows.
 template <class S, class Visitor>
@@ -317,6 +321,10 @@ DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int 
     const int64_t i = Visitor::kBackToFront ? end - 1 - k : begin + k;
     const int64_t next =
         Visitor::kBackToFront ? max(i - kPrefetchDistance, begin) : min(i + kPrefetchDistance, end - 1);
+    if (!list.wants(i)) {
+      visitor.skip(tile.saved.instances[i].slot);
+      continue;
+    }
     list.load(i, next, gaussian);
     visitor.expect(tile.saved.instances[next].slot);
     auto sums = visitor.begin(gaussian);

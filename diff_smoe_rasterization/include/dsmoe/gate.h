@@ -73,8 +73,8 @@ template <class S> DSMOE_HD S near_alpha(S opacity, S least_alpha) {
 // The squared reach of a Gaussian's near pairs. squared_reach: of all its pairs.
 template <class S> DSMOE_HD S near_reach(S opacity, S squared_reach) {
   if (!(opacity > S(0))) return squared_reach;
-  const S core = min(S(2) * log(opacity / S(kCoreAlpha)), S(-2 * kLn2 * kLog2CoreKernel));
-  return min(squared_reach, max(S(2) * log(opacity / S(kAlphaCut)), core));
+  const S outer = S(2) * log(opacity / S(kAlphaCut));  // kCoreAlpha is a quarter of kAlphaCut
+  return min(squared_reach, max(outer, min(outer + S(4 * kLn2), S(-2 * kLn2 * kLog2CoreKernel))));
 }
 
 template <class Real> struct Gate {

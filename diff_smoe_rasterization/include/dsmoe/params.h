@@ -82,8 +82,11 @@ template <class S> struct RasterConfig {
 
 // One (Gaussian, tile) pair, in a tile's list from front to back.
 struct TileInstance {
-  int32_t gaussian;
-  uint32_t slot;  // where its gradient goes: the Gaussian's instances lie side by side
+  int32_t gaussian;  // or ~i, if only wide pixels may have pairs of Gaussian i here
+  uint32_t slot;     // where its gradient goes: the Gaussian's instances lie side by side
+
+  DSMOE_HD bool has_near_pairs() const { return gaussian >= 0; }
+  DSMOE_HD int32_t index() const { return gaussian >= 0 ? gaussian : ~gaussian; }
 };
 
 // What the CPU's forward pass leaves for the backward pass; rows of culled Gaussians are zero.
