@@ -235,7 +235,7 @@ def test_photographs_are_of_one_camera_if_size_and_focal_length_say_so(tmp_path)
     names = ["a.jpg", "c.jpg", "d.jpg", "b.jpg", "e.jpg"]
     assert photos._by_camera(str(tmp_path), names, None) == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"], ["e.jpg"]]
     assert photos._by_camera(str(tmp_path), ["a.jpg", "d.jpg"], 90.0) == [["a.jpg"], ["d.jpg"]]
-    with pytest.raises(SceneError, match="--fov is 90, which is of one focal length; .* several .24 mm, 50 mm, none.; "):
+    with pytest.raises(SceneError, match="--fov is 90, which is of one focal length; .* several .24 mm, 50 mm, none"):
         photos._by_camera(str(tmp_path), names, 90.0)
 
 
