@@ -59,6 +59,10 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
                          "and fy above 0")
     ends = []
     if end is not None:
+        if not (isinstance(end, (tuple, list)) and len(end) == 2):
+            shape = f", shape {list(end.shape)}" if isinstance(end, torch.Tensor) else ""
+            raise ValueError(f"settings_from_camera: end is of type {type(end).__name__}{shape}; it must be a tuple of "
+                             "two, R [3, 3] and t [3] at the last row or column")
         view_end, center_end = _pose("end: ", *end, device)
         ends, center = [view_end.T], (center + center_end) / 2
     view, projection, center, *ends = (matrix.contiguous().to(bg.device, dtype) for matrix in (

@@ -12,7 +12,7 @@ import threading
 import time
 import urllib.parse
 from dataclasses import dataclass
-from typing import Any, Callable, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -177,19 +177,20 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
             fov: Optional[float], progress: bool, say: Callable[[str], None]) -> Any:
     """The largest model that COLMAP makes of the photographs, which it also writes to WORK/best. Raises SceneError."""
     database, count = os.path.join(work, DATABASE), len(names)
-    one_camera = _are_of_one_camera(photos, names)
-    guess = _first_guess(photos, names, camera_model, fov, one_camera)
-    if _forget_others(photos, names, work, f"{camera_model} {guess}".strip()):
+    cameras = _by_camera(photos, names, fov)
+    guesses = [_camera_guess(pycolmap, os.path.join(photos, first), camera_model, fov) for first, *_ in cameras]
+    if _forget_others(photos, names, work, f"{camera_model} {fov}"):
         say("photographs or camera model have changed since the last time: all features are found anew")
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = camera_model
-    reader.camera_params = guess
-    mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
-    say(f"finding features in {count} photographs of {'one camera' if one_camera else 'several cameras'}, on the "
+    say(f"finding features in {count} photographs of {'several cameras' if cameras[1:] else 'one camera'}, on the "
         f"{'GPU' if pycolmap.has_cuda else 'CPU'}")
-    _while_counting(pycolmap, lambda token: pycolmap.extract_features(
-        database, photos, names, mode, reader, cancellation_token=token),
-        lambda: _count_rows(database, "descriptors"), count, "features", progress)
+    mode = pycolmap.CameraMode.SINGLE
+    if cameras[1:] and not any(guesses):  # COLMAP's own guesses need no pass for each
+        cameras, guesses, mode = [names], [""], pycolmap.CameraMode.AUTO
+    for group, guess in zip(cameras, guesses):
+        reader = _reader(pycolmap, camera_model, guess)
+        _while_counting(pycolmap, lambda token, group=group, reader=reader: pycolmap.extract_features(
+            database, photos, group, mode, reader, cancellation_token=token),
+            lambda: _count_rows(database, "descriptors"), count, "features", progress)
     if matching == "auto":
         matching = "exhaustive" if count <= MOST_EXHAUSTIVE else "sequential"
     pairs = count * (count - 1) // 2
@@ -225,22 +226,39 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
     return best
 
 
-def _first_guess(photos: str, names: Sequence[str], camera_model: str, fov: Optional[float], one_camera: bool) -> str:
-    """The camera's parameters from which COLMAP starts; empty: as it guesses them, for 48 degrees.
+def _reader(pycolmap: Any, camera_model: str, guess: str) -> Any:
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model, options.camera_params = camera_model, guess
+    return options
 
-    Through a fisheye it places nothing without, as it compares photographs by a pinhole. Raises SceneError.
+
+def _camera_guess(pycolmap: Any, photo: str, camera_model: str, fov: Optional[float]) -> str:
+    """As `_first_guess`, unless COLMAP knows the focal length in pixels, which millimetres alone do not tell it."""
+    guess = _first_guess(photo, camera_model, fov)
+    if not guess or fov is not None:
+        return guess
+    camera = _in_thread(pycolmap, lambda token: pycolmap.infer_camera_from_image(
+        photo, _reader(pycolmap, camera_model, "")))
+    return "" if camera.has_prior_focal_length else guess
+
+
+def _first_guess(photo: str, camera_model: str, fov: Optional[float]) -> str:
+    """The parameters from which COLMAP starts for cameras of the photograph's size; empty: as it guesses them itself.
+
+    Through a fisheye it places nothing from its own guess of 48 degrees, as it compares photographs by a pinhole.
+    Raises SceneError.
     """
-    is_fisheye, first = "FISHEYE" in camera_model, os.path.join(photos, names[0])
-    if fov is None and not (is_fisheye and one_camera and _recorded_focal_length(first) is None):
+    is_fisheye = "FISHEYE" in camera_model
+    if fov is None and not is_fisheye:
         return ""
+    if camera_model not in MODELS:
+        raise SceneError(f"the camera model is {camera_model}, of which no first guess is known here; it must be one "
+                         f"of {', '.join(MODELS)}{'' if is_fisheye else ', or without a field of view (fov)'}")
     angle, most = FISHEYE_FOV if fov is None else fov, MOST_FISHEYE_FOV if is_fisheye else MOST_FOV
     if camera_model == AROUND or not 1 <= angle <= most:
         allowed = f"between 1 and {most:g} degrees" if camera_model != AROUND else "left out: it is 360 degrees"
         raise SceneError(f"--fov is {angle:g}; for --camera-model {camera_model} it must be {allowed}")
-    if not one_camera:
-        raise SceneError(f"--fov is {angle:g}, which is of one camera; the photographs in {photos} have several "
-                         "sizes or focal lengths")
-    width, height = image_size(first)
+    width, height = image_size(photo)
     half = math.radians(angle) / 2
     focal = max(width, height) / 2 / (half if is_fisheye else math.tan(half))
     focals, _, coefficients = MODELS[camera_model]
@@ -277,13 +295,20 @@ def _checksum(path: str) -> str:
     return hashed.hexdigest()
 
 
-def _are_of_one_camera(photos: str, names: Sequence[str]) -> bool:
-    """Whether all have one size, and one focal length if they record it."""
-    kinds = set()
+def _by_camera(photos: str, names: Sequence[str], fov: Optional[float]) -> List[List[str]]:
+    """The names by camera: those of one size, and of one focal length if they record it.
+
+    Raises SceneError if they record several while `fov` is given.
+    """
+    cameras: Dict[Tuple[Tuple[int, int], Optional[float]], List[str]] = {}
     for name in names:
         path = os.path.join(photos, name)
-        kinds.add((image_size(path), _recorded_focal_length(path)))
-    return len(kinds) == 1
+        cameras.setdefault((image_size(path), _recorded_focal_length(path)), []).append(name)
+    focals = [f"{focal:g} mm" if focal else "none" for focal in {focal: 0 for _, focal in cameras}]
+    if fov is not None and len(focals) > 1:
+        raise SceneError(f"--fov is {fov:g}, which is of one focal length; the photographs in {photos} record several "
+                         f"({', '.join(focals[:3])}{', ...' * bool(focals[3:])}); leave it out")
+    return [*cameras.values()]
 
 
 def _recorded_focal_length(path: str) -> Optional[float]:

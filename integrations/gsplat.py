@@ -214,7 +214,7 @@ def _distortions(camera_model, num_cameras, radial, tangential, thin_prism):
 def _shutter(given, viewmats_rs, viewmats):
     """Returns the shutter's name in the settings."""
     name = "GLOBAL" if given is None else getattr(given, "name", given)
-    if isinstance(name, int) and 0 <= name < len(ROLLING_SHUTTERS):
+    if isinstance(name, int) and not isinstance(name, bool) and 0 <= name < len(ROLLING_SHUTTERS):
         name = ROLLING_SHUTTERS[name]
     _check_choice("rolling_shutter", name, ROLLING_SHUTTERS)
     if (name == "GLOBAL") != (viewmats_rs is None):
@@ -225,6 +225,9 @@ def _shutter(given, viewmats_rs, viewmats):
         if viewmats_rs.dtype != viewmats.dtype:
             raise TypeError(f"rasterization: viewmats_rs is {viewmats_rs.dtype}; it must be {viewmats.dtype}, as "
                             "viewmats is")
+        if viewmats_rs.device != viewmats.device:
+            raise TypeError(f"rasterization: viewmats_rs is on {viewmats_rs.device}; it must be on {viewmats.device}, "
+                            "as viewmats is")
     return name.lower().replace("rolling_", "")
 
 

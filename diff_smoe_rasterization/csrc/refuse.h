@@ -390,8 +390,14 @@ template <class Frame> void refuse_mark_visible(const char* function, const Fram
   const int64_t count = frame.inputs.num_gaussians;
   refuse_null(function, "means3D", frame.inputs.means3D, "[N, 3]", count);
   refuse_null(function, "camera.view", frame.camera.view, "[4, 4]", count);
+  const bool rolls = frame.camera.shutter != Shutter::kGlobal;
   if constexpr (kOnHost<Frame>) {
     refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", frame.camera.view);
+    if (rolls) {
+      refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view_end (viewmatrix_end)", frame.camera.view_end);
+    }
+  } else if (rolls) {
+    refuse_null(function, "camera.view_end", frame.camera.view_end, "[4, 4]", count);
   }
   refuse_null(function, "visible", visible, "[N]", count);
 }

@@ -17,7 +17,7 @@ from ..errors import SceneError
 from ..options.config import TrainConfig
 from ..system.files import is_file
 from .cameras import Camera
-from .images import View, fitted_camera, size_of_image
+from .images import View, fitted_camera, shown_by_lens, size_of_image
 from .layout import Layout, PosedImage, hold_out
 from .lens import lens_named
 
@@ -109,5 +109,5 @@ def rendered_views(model: str, images: Sequence[PosedImage], config: TrainConfig
     for posed in images:
         camera = fitted_camera(posed, size_of_image(posed), config)
         image = (quantised(renderer(camera).color) * 255).round().to(torch.uint8)
-        views.append(View(camera, image, checksum=checksum))
+        views.append(View(camera, image, mask=shown_by_lens(camera), checksum=checksum).to(config.device))
     return views

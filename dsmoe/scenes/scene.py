@@ -132,7 +132,8 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     lines = [layout.warning, scene.note]
     models = sorted({view.camera.lens.camera_model for view in views if view.camera.lens})
     if models:
-        why = ", since undistortion would cut off much of them" if config.lenses == "auto" else ""
+        chosen = config.lenses == "auto" and layout.kind != "model"  # whose renderings keep any lens
+        why = ", since undistortion would cut off much of them" if chosen else ""
         masked = any(shown_by_lens(view.camera) is not None for view in views)
         lines.append(f"images of camera model {', '.join(models)} stay as they are{why}; Gaussians are projected "
                      f"through it{', pixels beyond the lens are masked' * masked}")

@@ -226,6 +226,8 @@ def test_settings_from_camera_of_a_rolling_shutter():
     assert end[1].grad is not None and t.grad is None
     with pytest.raises(ValueError, match="end: R is .*; it must be a rotation"):
         settings_from_camera(K, R, t, 40, 30, rolling_shutter="top_to_bottom", end=(2 * R, t))
+    with pytest.raises(ValueError, match=r"end is of type Tensor, shape \[3, 3\]; it must be a tuple of two, R .* t"):
+        settings_from_camera(K, R, t, 40, 30, rolling_shutter="top_to_bottom", end=R)
     with pytest.raises(ValueError, match="viewmatrix_end is None, but rolling_shutter is 'left_to_right'; it must be"):
         settings_from_camera(K, R, t, 40, 30, rolling_shutter="left_to_right")
 
@@ -258,3 +260,5 @@ def test_a_pose_that_is_not_finite_is_named():
     end[1, 2] = math.nan
     with pytest.raises(ValueError, match=r"camera.view_end \(viewmatrix_end\)\[6\] is nan; it must be finite"):
         rasterize(settings=scene.settings._replace(viewmatrix_end=end), **scene.inputs)
+    with pytest.raises(ValueError, match=r"camera.view_end \(viewmatrix_end\)\[6\] is nan; it must be finite"):
+        GaussianRasterizer(scene.settings._replace(viewmatrix_end=end)).markVisible(scene.inputs["means3D"])

@@ -178,11 +178,17 @@ def test_rolling_shutters_are_the_references(shutter, own):
     (dict(rolling_shutter=2), "viewmats_rs is None, but rolling_shutter is ROLLING_BOTTOM_TO_TOP; it must be given"),
     (dict(viewmats_rs=torch.eye(4, device="cpu")), "viewmats_rs is given, but rolling_shutter is GLOBAL; it must be "
      "None"),
+    (dict(rolling_shutter=True, viewmats_rs=torch.eye(4, device="cpu")), "rolling_shutter is True; it must be one of"),
     (dict(rolling_shutter="SIDEWAYS"), "rolling_shutter is 'SIDEWAYS'; it must be one of ROLLING_TOP_TO_BOTTOM"),
     (dict(rolling_shutter=0, viewmats_rs=torch.eye(4, device="cpu")), r"viewmats_rs has shape \[4, 4\]; it must be")])
 def test_bad_shutters_are_named(small, arguments, message):
     with pytest.raises(ValueError, match=message):
         rasterization(**small, **arguments)
+
+
+def test_a_last_pose_on_another_device_is_named(small):
+    with pytest.raises(TypeError, match=f"viewmats_rs is on meta; it must be on {small['viewmats'].device}, as "):
+        rasterization(**small, rolling_shutter=0, viewmats_rs=small["viewmats"].to("meta"))
 
 
 def test_coefficients_that_a_lens_has_not_are_refused(small):

@@ -231,6 +231,30 @@ def test_pixels_beyond_a_native_lens_are_masked(tmp_path):
     assert not both[:, :WIDTH // 2].any() and (both[:, WIDTH // 2:] == mask[:, WIDTH // 2:]).all()
 
 
+def test_renderings_through_a_lens_are_masked(tmp_path, capsys):
+    """A model is its own teacher through the lens of the test above; nothing weighed undistortion for it."""
+    camera = Camera("a", np.eye(3), np.zeros(3), FX, FX, CX, CY, WIDTH, HEIGHT, lens_of("RADIAL", False, {"k1": -1.2}))
+    folder, means = str(tmp_path / "model"), np.random.RandomState(0).normal([0, 0, 3], 0.5, (20, 3))
+    ply = os.path.join(folder, "point_cloud", "iteration_1", "point_cloud.ply")
+    os.makedirs(os.path.dirname(ply))
+    arrays = dict(means3D=means, dc=np.ones((20, 1, 3)), shs=np.zeros((20, 0, 3)), opacity_logits=np.ones((20, 1)),
+                  log_scales=np.full((20, 3), -2.0), rotations=np.tile([1.0, 0, 0, 0], (20, 1)))
+    io.write_gaussians(ply, io.Gaussians(**{name: array.astype(np.float32) for name, array in arrays.items()}))
+    with open(os.path.join(folder, "cameras.json"), "w", encoding="utf-8") as file:
+        json.dump(cameras_content([camera, camera]), file)  # to train on and to test
+    mask = load_scene(TrainConfig(scene=folder, test_every=0, device="cpu"), progress=False).train[0].mask[0].numpy()
+    x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / FX, (np.arange(HEIGHT) + 0.5 - CY) / FX)
+    beyond = np.hypot(x, y) > 2 / 3 * math.sqrt(1 / 3.6)
+    assert beyond.any() and (mask == np.where(beyond, 0, 255)).all()
+    output = str(tmp_path / "out")
+    assert main(["simplify", folder, "--keep", "0.5", "-o", output, "--iterations", "4", "--device", "cpu"]) == 0
+    text = capsys.readouterr().out
+    assert "camera model opencv stay as they are; Gaussians" in text and "pixels beyond the lens are masked" in text
+    with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
+        protocol = json.load(file)[0]["protocol"]
+    assert protocol["scene_kind"] == "model" and protocol["masks"]
+
+
 @pytest.mark.parametrize("model, params, words", [
     ("RADIAL", [FX, CX, CY, -1e5, 0.0], r"1.png: the lens folds the image back at 0.0\d+ pixels .* \[-100000.0, "),
     # r (1 - 45 r^2) ends at 2/3 sqrt(1 / 135) = 0.057, of 70 pixels 4.0: less than a tenth of 72

@@ -220,19 +220,23 @@ def test_hidden_files_and_the_scene_itself_are_no_photographs(tmp_path):
     assert photos.photo_names(str(tmp_path), str(tmp_path / "scene")) == ["a.jpg", "scenery/c.jpg", "walk/b.PNG"]
 
 
-def test_photographs_are_of_one_camera_if_size_and_focal_length_say_so(tmp_path):
-    def save(name, size=(8, 6), focal=None):
-        exif = Image.Exif()
-        if focal:
-            exif.get_ifd(photos.EXIF)[photos.FOCAL_LENGTH] = focal
-        Image.new("RGB", size).save(tmp_path / name, exif=exif)
+def save_photograph(path, size, focal=None):
+    """focal: millimetres, which alone tell COLMAP nothing."""
+    exif = Image.Exif()
+    if focal:
+        exif.get_ifd(photos.EXIF)[photos.FOCAL_LENGTH] = focal
+    Image.new("RGB", size).save(path, exif=exif)
 
-    save("a.jpg", focal=24.0)
-    save("b.jpg", focal=24.0)
-    save("c.jpg", focal=50.0)
-    save("d.jpg", size=(6, 8), focal=24.0)
-    assert [photos._are_of_one_camera(str(tmp_path), names) for names in (
-        ["a.jpg", "b.jpg"], ["a.jpg", "c.jpg"], ["a.jpg", "d.jpg"])] == [True, False, False]
+
+def test_photographs_are_of_one_camera_if_size_and_focal_length_say_so(tmp_path):
+    for name, size, focal in (("a.jpg", (8, 6), 24.0), ("b.jpg", (8, 6), 24.0), ("c.jpg", (8, 6), 50.0),
+                              ("d.jpg", (6, 8), 24.0), ("e.jpg", (6, 8), None)):
+        save_photograph(tmp_path / name, size, focal)
+    names = ["a.jpg", "c.jpg", "d.jpg", "b.jpg", "e.jpg"]
+    assert photos._by_camera(str(tmp_path), names, None) == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"], ["e.jpg"]]
+    assert photos._by_camera(str(tmp_path), ["a.jpg", "d.jpg"], 90.0) == [["a.jpg"], ["d.jpg"]]
+    with pytest.raises(SceneError, match="--fov is 90, which is of one focal length; .* several .24 mm, 50 mm, none"):
+        photos._by_camera(str(tmp_path), names, 90.0)
 
 
 class FakeModel:
@@ -316,26 +320,42 @@ def test_a_photograph_that_training_cannot_read_is_named(tmp_path, monkeypatch, 
 
 def test_what_colmap_starts_from(tmp_path):
     """Of 80 pixels across: 40 are half of 150 degrees of a fisheye, and half of 90 of any other camera."""
-    def save(name, size, focal=None):
-        exif = Image.Exif()
-        if focal:
-            exif.get_ifd(photos.EXIF)[photos.FOCAL_LENGTH] = focal
-        Image.new("RGB", size).save(tmp_path / name, exif=exif)
+    def guess(camera_model, fov=None, name="a.jpg", prior=False):
+        colmap = SimpleNamespace(ImageReaderOptions=SimpleNamespace, CancellationToken=SimpleNamespace,
+                                 infer_camera_from_image=lambda *_: SimpleNamespace(has_prior_focal_length=prior))
+        return photos._camera_guess(colmap, str(tmp_path / name), camera_model, fov)
 
-    def guess(camera_model, fov=None, name="a.jpg", one_camera=True):
-        return photos._first_guess(str(tmp_path), [name], camera_model, fov, one_camera)
-
-    save("a.jpg", (80, 60))
-    save("b.jpg", (60, 80), focal=24.0)
-    assert guess("OPENCV") == guess("EQUIRECTANGULAR") == guess("OPENCV_FISHEYE", one_camera=False) == ""
-    assert guess("OPENCV_FISHEYE", name="b.jpg") == "", "it records one"
-    fisheye = [float(number) for number in guess("OPENCV_FISHEYE").split(",")]
-    assert fisheye == pytest.approx([40 / np.radians(75)] * 2 + [40, 30, 0, 0, 0, 0], rel=1e-5)
+    save_photograph(tmp_path / "a.jpg", (80, 60))
+    save_photograph(tmp_path / "b.jpg", (60, 80), focal=24.0)
+    assert guess("OPENCV") == guess("EQUIRECTANGULAR") == guess("FOV") == guess("OPENCV_FISHEYE", prior=True) == ""
+    for name, center in (("a.jpg", [40, 30]), ("b.jpg", [30, 40])):
+        fisheye = [float(number) for number in guess("OPENCV_FISHEYE", name=name).split(",")]
+        assert fisheye == pytest.approx([40 / np.radians(75)] * 2 + [*center, 0, 0, 0, 0], rel=1e-5)
     assert guess("OPENCV", 90.0) == "40,40,40,30,0,0,0,0" and guess("SIMPLE_RADIAL", 90.0, "b.jpg") == "40,30,40,0"
     for camera_model, fov, words in (("OPENCV", 175.0, "must be between 1 and 170 degrees"),
                                      ("OPENCV_FISHEYE", 350.0, "between 1 and 340"), ("OPENCV", np.nan, "nan; for"),
                                      ("EQUIRECTANGULAR", 90.0, "must be left out: it is 360 degrees")):
         with pytest.raises(SceneError, match=f"--fov is .*{words}"):
             guess(camera_model, fov)
-    with pytest.raises(SceneError, match="--fov is 90, which is of one camera; .* several sizes or focal lengths"):
-        guess("OPENCV", 90.0, one_camera=False)
+    with pytest.raises(SceneError, match=r"camera model is FOV, of which .* one of SIMPLE_.*, or without .* \(fov\)$"):
+        guess("FOV", 90.0)
+    with pytest.raises(SceneError, match="is RAD_TAN_THIN_PRISM_FISHEYE, of which .* EQUIRECTANGULAR$"):
+        guess("RAD_TAN_THIN_PRISM_FISHEYE")
+
+
+def test_each_size_of_fisheye_photographs_has_its_guess(tmp_path):
+    """One portrait among others: COLMAP has a camera for each size, of the same focal length."""
+    pytest.importorskip("pycolmap", reason="pip install pycolmap")
+    (tmp_path / "photos").mkdir()
+    for name, size in (("a.jpg", (80, 60)), ("b.jpg", (60, 80)), ("c.jpg", (80, 60))):
+        save_photograph(tmp_path / "photos" / name, size, focal=3.0)
+    with pytest.raises(SceneError, match="only 0 of 3 photographs connect"):
+        photos.make_scene(str(tmp_path / "photos"), str(tmp_path / "scene"), camera_model="OPENCV_FISHEYE",
+                          progress=False)
+    with contextlib.closing(sqlite3.connect(tmp_path / "scene" / "colmap" / photos.DATABASE)) as database:
+        found = {(width, height): list(np.frombuffer(numbers)) for width, height, numbers in database.execute(
+            "SELECT width, height, params FROM cameras")}
+        assert database.execute("SELECT COUNT(*) FROM cameras").fetchone() == (2,)
+    for size in ((80, 60), (60, 80)):
+        assert found[size] == pytest.approx([40 / np.radians(75)] * 2 + [size[0] / 2, size[1] / 2, 0, 0, 0, 0],
+                                            rel=1e-5), "of 6 digits"
