@@ -70,8 +70,9 @@ class ProcessGate:
         self._put(torch.full((1,), math.log(START)))
 
     def _put(self, logarithm: torch.Tensor) -> None:
-        self._logarithm = logarithm
-        self._value = logarithm.exp().requires_grad_()
+        with torch.inference_mode(False):
+            self._logarithm = logarithm.clone()
+            self._value = self._logarithm.exp().requires_grad_()
         if not _HAS_HOOKS:
             self._value.register_hook(self._step)
 
@@ -101,8 +102,8 @@ class ProcessGate:
         with torch.inference_mode(False), torch.no_grad():  # renderings that come later have gradients
             self._logarithm.fill_(state["logarithm"])
             self._value.data = torch.full_like(self._value, start)
-        self._adam = {name: one if name == "step" else torch.full_like(self._logarithm, one)
-                      for name, one in state["adam"].items()}
+            self._adam = {name: one if name == "step" else torch.full_like(self._logarithm, one)
+                          for name, one in state["adam"].items()}
         self._found, self._value.grad = value, None
 
     def state_dict(self) -> Dict[str, Any]:
@@ -117,12 +118,12 @@ class ProcessGate:
         tensors: of the Gaussians; lambda has the type and device of the first. means3D: their centres, if known.
         """
         self.blend_mode, like = blend_mode, tensors[0]
-        if like.is_cuda and torch.cuda.is_current_stream_capturing():
-            raise RuntimeError("Python steps a learned background gate, and a CUDA graph does not repeat that; where a "
-                               "graph is captured give background_gate as a tensor or a number")
         with_gradient = not self.frozen and torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
         if not with_gradient and (self.frozen or self._found is not None):
             return self.value()
+        if like.is_cuda and torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("Python steps a learned background gate, and a CUDA graph does not repeat that; where a "
+                               "graph is captured give background_gate as a tensor or a number")
         if self._logarithm.device != like.device and not self._learns:
             self._adam = {name: one if name == "step" else one.to(like.device) for name, one in self._adam.items()}
             self._put(self._logarithm.to(like.device))

@@ -314,9 +314,10 @@ def _by_camera(photos: str, names: Sequence[str], fov: Optional[float]) -> List[
 def _recorded_focal_length(path: str) -> Optional[float]:
     try:
         with open_image(path) as file:
-            return float(file.getexif().get_ifd(EXIF)[FOCAL_LENGTH])
+            focal = float(file.getexif().get_ifd(EXIF)[FOCAL_LENGTH])
     except (*UNREADABLE, KeyError, TypeError, ZeroDivisionError):
         return None
+    return focal if 0 < focal < math.inf else None
 
 
 def _taken_over(made: str, output: str, subject: str, earlier: Sequence[str]) -> List[str]:

@@ -190,9 +190,10 @@ def _folder_beside(target: str) -> str:
         if os.path.exists(target) and not stat.S_ISREG(os.stat(target).st_mode):
             return ""
         where = os.path.dirname(target)
-        for left in glob.glob(os.path.join(glob.escape(where), f"{PART}*", "")):
+        for left in glob.glob(os.path.join(glob.escape(where), f"{PART}*")):
             with contextlib.suppress(OSError):
-                if time.time() - os.stat(left).st_mtime > ABANDONED:  # of a process that was killed
+                there = os.lstat(left)  # a link is somebody else's
+                if stat.S_ISDIR(there.st_mode) and time.time() - there.st_mtime > ABANDONED:  # its process was killed
                     shutil.rmtree(left, ignore_errors=True)
         return tempfile.mkdtemp(prefix=PART, dir=where)
     except OSError:

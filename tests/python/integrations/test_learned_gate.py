@@ -282,9 +282,11 @@ def test_a_gate_of_0_that_was_found_is_rendered_until_the_first_step():
 def test_a_gate_that_was_found_without_gradients_has_one_later():
     view, gaussians = scene()
     with torch.inference_mode():
-        gate.found(0.3)
+        gate.found(0.3, {"logarithm": math.log(0.3), "adam": {"step": 1, "exp_avg": 0.1, "exp_avg_sq": 0.1}})
+    optimizer = torch.optim.SGD(gaussians.values(), lr=0)
     loss(view, gaussians).backward()
-    assert gate.learns
+    optimizer.step()
+    assert gate.value() not in (0.3, START)
 
 
 @pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
@@ -677,8 +679,13 @@ def test_a_save_removes_what_a_killed_one_left_long_ago(tmp_path, process):
     for name, days in (("old", 2), ("new", 0)):
         (tmp_path / f".dsmoe_part-{name}").mkdir()
         os.utime(tmp_path / f".dsmoe_part-{name}", (time.time() - days * 86400,) * 2)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").write_text("precious")
+    os.utime(tmp_path / "mine", (0, 0))
+    (tmp_path / ".dsmoe_part-link").symlink_to("mine")
     torch.save(torch.zeros(3), tmp_path / "model.pth")
-    assert {one.name for one in tmp_path.iterdir()} == {".dsmoe_part-new", "model.pth"}
+    assert {one.name for one in tmp_path.iterdir()} == {".dsmoe_part-new", ".dsmoe_part-link", "mine", "model.pth"}
+    assert (tmp_path / "mine" / "file").exists()
 
 
 def test_a_file_is_written_where_and_as_it_would_be_without_a_record(tmp_path, process):
