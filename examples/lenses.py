@@ -4,7 +4,7 @@ import math
 
 import torch
 from PIL import Image, ImageDraw
-from render_ply import load, look_at
+from render_ply import ask_for_camera, load, look_at
 
 from diff_smoe_rasterization import rasterize
 
@@ -39,8 +39,7 @@ def seen(gaussians, options, name, place):
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("model", help="a .ply of 3DGS, or of this trainer")
-parser.add_argument("--eye", type=float, nargs=3, default=[2.7, 1.6, 0.3], help="where the camera is")
-parser.add_argument("--target", type=float, nargs=3, default=[0.0, 0.6, 0.0], help="what it looks at")
+ask_for_camera(parser)
 parser.add_argument("--up", type=float, nargs=3, default=[0.0, 1.0, 0.0], help="what is up in its images")
 parser.add_argument("--bonsai", action="store_true", help="of a model of bonsai: the place of the picture in docs/")
 parser.add_argument("-o", "--output", default="lenses.jpg")

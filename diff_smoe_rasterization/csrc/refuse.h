@@ -144,6 +144,20 @@ template <class S> void refuse_inputs(const char* function, const GaussianInputs
   refuse_given(function, inputs, num_channels);
 }
 
+// Poses that cannot be read. size: null will do where that is 0.
+template <class Frame> void refuse_poses(const char* function, const Frame& frame, int64_t size) {
+  const auto& camera = frame.camera;
+  const bool rolls = camera.shutter != Shutter::kGlobal;
+  if constexpr (kOnHost<Frame>) {
+    refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", camera.view);
+    if (!rolls) return;
+    refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view_end (viewmatrix_end)", camera.view_end);
+  } else {
+    refuse_null(function, "camera.view", camera.view, "[4, 4]", size);
+    if (rolls) refuse_null(function, "camera.view_end", camera.view_end, "[4, 4]", size);
+  }
+}
+
 template <class Frame> void refuse_projection(const char* function, const Frame& frame) {
   const auto& camera = frame.camera;
   refuse_frame(function, frame);
@@ -162,26 +176,20 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
   if (shutter < 0 || shutter >= kNumShutters) {
     refuse(function, "camera.shutter (rolling_shutter) is ", shutter, "; it must be 0 to ", kNumShutters - 1);
   }
-  const bool rolls = camera.shutter != Shutter::kGlobal;
-  if (rolls && pinhole) {
+  if (camera.shutter != Shutter::kGlobal && pinhole) {
     refuse(function, "camera.shutter is ", kShutterNames[shutter],
            ", but camera.lens is a pinhole; it must be another lens, such as opencv without distortion");
   }
+  refuse_poses(function, frame, 1);
   if constexpr (kOnHost<Frame>) {
-    refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", camera.view);
     if (pinhole) {
       refuse_unless_finite_but(kUnreadClipColumn, function, "camera.projection (projmatrix)", camera.projection);
-    }
-    if (rolls) {
-      refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view_end (viewmatrix_end)", camera.view_end);
     }
     const bool read = frame.inputs.dc != nullptr || frame.inputs.shs != nullptr;
     for (int i = 0; read && i < 3; ++i) refuse_unless_finite(function, "camera.position (campos)", camera.position, i);
   } else {
-    refuse_null(function, "camera.view", camera.view, "[4, 4]", 1);
     refuse_null(function, "camera.projection", camera.projection, "[4, 4]", 1);
     refuse_null(function, "camera.position", camera.position, "[3]", 1);
-    if (rolls) refuse_null(function, "camera.view_end", camera.view_end, "[4, 4]", 1);
   }
 }
 
@@ -389,16 +397,7 @@ template <class Frame, class Pass> void refuse_importance(const char* function, 
 template <class Frame> void refuse_mark_visible(const char* function, const Frame& frame, const bool* visible) {
   const int64_t count = frame.inputs.num_gaussians;
   refuse_null(function, "means3D", frame.inputs.means3D, "[N, 3]", count);
-  refuse_null(function, "camera.view", frame.camera.view, "[4, 4]", count);
-  const bool rolls = frame.camera.shutter != Shutter::kGlobal;
-  if constexpr (kOnHost<Frame>) {
-    refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view (viewmatrix)", frame.camera.view);
-    if (rolls) {
-      refuse_unless_finite_but(kUnreadViewColumn, function, "camera.view_end (viewmatrix_end)", frame.camera.view_end);
-    }
-  } else if (rolls) {
-    refuse_null(function, "camera.view_end", frame.camera.view_end, "[4, 4]", count);
-  }
+  refuse_poses(function, frame, count);
   refuse_null(function, "visible", visible, "[N]", count);
 }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from dataclasses import dataclass
-from typing import List, Optional, Sequence, Tuple
+from typing import Dict, Hashable, List, Optional, Sequence, Tuple
 
 from ..errors import SceneError, printable
 from ..system.files import is_file, is_folder
@@ -79,13 +79,22 @@ def without_missing(folder: str, layout: Layout, strict: bool) -> Layout:
 
 def check_lenses(folder: str, layout: Layout) -> None:
     """Raises SceneError for a lens that cannot be that of its image."""
-    for image in [*layout.train, *layout.test]:
-        camera = image.camera
+    for camera, lens in each_lens(layout):
         try:
-            if image.lens:
-                image.lens.check(max(camera.fx, camera.fy), camera.width, camera.height)
+            lens.check(max(camera.fx, camera.fy), camera.width, camera.height)
         except ValueError as error:
             raise SceneError(f"scene {folder}: {camera.name}: {error}") from error
+
+
+def each_lens(layout: Layout) -> List[Tuple[Camera, Lens]]:
+    """The lenses of the images, each with the camera of its first image; other intrinsics count as another lens."""
+    found: Dict[Hashable, Tuple[Camera, Lens]] = {}
+    for image in [*layout.train, *layout.test]:
+        camera, lens = image.camera, image.lens
+        if lens:
+            of_size = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+            found.setdefault((lens, of_size), (camera, lens))
+    return [*found.values()]
 
 
 def with_lenses(layout: Layout) -> Layout:

@@ -28,7 +28,7 @@ from .images import (
     size_of,
     unreadable,
 )
-from .layout import Layout, PosedImage
+from .layout import Layout, PosedImage, each_lens
 from .lens import AROUND, THIN_PRISM, Lens
 
 CACHE_VARIABLE = "DSMOE_CACHE"  # a folder for undistorted images, in place of the scene's own
@@ -89,8 +89,7 @@ def cut_off(camera: Camera, lens: Lens) -> float:
 
 def trains_natively(layout: Layout, lenses: str) -> bool:
     """Whether a scene's images keep their lens, by --lenses."""
-    images = [*layout.train, *layout.test] if lenses == "auto" else []
-    return lenses == "native" or any(cut_off(image.camera, image.lens) > MOST_CUT for image in images if image.lens)
+    return lenses == "native" or lenses == "auto" and any(cut_off(*one) > MOST_CUT for one in each_lens(layout))
 
 
 def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str]:

@@ -6,17 +6,25 @@ import math
 import numpy as np
 import pytest
 import torch
-from comparison import assert_all_close, assert_close, one_thread, reference_gradients, threshold_margin
-from devices import on_the_cpu, random_normal
-from scenes import assert_not_empty, gradients, op_arguments, random_scene, turned
-from test_camera_models import FLOAT32_MARGIN, FLOAT64_TOLERANCE, LENSES, exact_lens, lens_scene
+from comparison import assert_all_close, assert_close
+from lens_scenes import (
+    GRID,
+    LENSES,
+    assert_reference_in_float32,
+    assert_reference_in_float64,
+    exact_lens,
+    lens_scene,
+    moments,
+    projected,
+    shape_error,
+)
+from scenes import gradients, op_arguments, random_scene, turned
 
 from diff_smoe_rasterization import (
     GaussianRasterizer,
     blend_footprints,
     project_gaussians,
     rasterize,
-    reference,
     settings_from_camera,
     visible_radii,
 )
@@ -31,7 +39,7 @@ EVERY_LENS = [(model, ROLLING_SHUTTERS[1 + k % 4]) for k, model in enumerate(MOD
 
 
 def rolling_scene(mode, model, shutter, covariance="scales", **options):
-    """The scene of test_camera_models.py, through which the camera turns and moves by 2 to 5 pixels."""
+    """The scene of lens_scenes.py, through which the camera turns and moves by 2 to 5 pixels."""
     if model == "pinhole":
         scene = random_scene(mode, 70, 40, 30, covariance=covariance, degree=1)
         scene = scene.with_settings(principal_point=(21.0, 14.5), **options)
@@ -44,38 +52,14 @@ def rolling_scene(mode, model, shutter, covariance="scales", **options):
 @pytest.mark.parametrize("model, shutter", EVERY_LENS)
 @pytest.mark.parametrize("mode, covariance", [*zip(BLEND_MODES, ["scales", "cov3D"] * 3), ("smoe", "scales")])
 def test_float64(mode, covariance, model, shutter):
-    scene = rolling_scene(mode, model, shutter, covariance).with_settings(antialiasing=True)
-    expected, expected_gradients = reference_gradients(scene, OUTPUTS)
-    assert_not_empty(expected, scene.to("cpu").settings)
-    rendering, found = gradients(rasterize, scene, OUTPUTS)
-    assert torch.equal(rendering.radii.cpu(), expected.radii)
-    for name in ("color", *OUTPUTS):
-        assert_close(getattr(rendering, name), getattr(expected, name), FLOAT64_TOLERANCE, name)
-    assert found["viewmatrix_end"].any()
     # Newton's last step leaves less than 1e-11 of a time, and derivatives are those of none.
-    assert_all_close(found, expected_gradients, 1e-10)
+    found = assert_reference_in_float64(rolling_scene(mode, model, shutter, covariance), gradient_tolerance=1e-10)
+    assert found["viewmatrix_end"].any()
 
 
 @pytest.mark.parametrize("model, shutter", EVERY_LENS)
 def test_float32(model, shutter):
-    scene = rolling_scene("smoe", model, shutter, near=1.0)
-    safe = threshold_margin(scene) > FLOAT32_MARGIN
-    assert safe.double().mean() > 0.8
-    weights = random_normal((3, 30, 40), 1).cpu() * safe
-
-    def masked(function, scene):
-        scene = scene.requiring_grad()
-        color = function(settings=scene.settings, **scene.inputs).color
-        leaves = scene.leaves()
-        values = torch.autograd.grad(color, list(leaves.values()), weights.to(color), allow_unused=True)
-        return color.detach().cpu(), {name: torch.zeros_like(leaf).cpu() if value is None else value.cpu()
-                                      for (name, leaf), value in zip(leaves.items(), values)}
-
-    with one_thread(), on_the_cpu():
-        expected, expected_gradients = masked(reference.rasterize, scene.to("cpu"))
-    color, found = masked(rasterize, scene.to(torch.float32))
-    assert_close(color[:, safe], expected[:, safe], 1e-5, "color")
-    assert_all_close(found, expected_gradients, 1e-4)  # as in test_against_reference.py
+    assert_reference_in_float32(rolling_scene("smoe", model, shutter, near=1.0))
 
 
 @pytest.mark.parametrize("shutter", ROLLING_SHUTTERS[1:])
@@ -111,24 +95,13 @@ def test_footprints_are_those_of_brute_force(model, distortion, shutter):
     axes = (np.geomspace(2, 11, count)[:, None] / focal * depth)[:, :, None] * np.stack(
         [across, 0.5 * np.cross(ray, across), 0.25 * ray], 2)
 
-    device = torch.zeros(0).device
-
-    def tensor(array):
-        return torch.as_tensor(array, dtype=torch.float64, device=device)
-
-    first = torch.eye(4, dtype=torch.float64, device=device)
+    first = torch.eye(4, dtype=torch.float64, device=torch.zeros(0).device)
     last = turned(first, (0.08, -0.1, 0.1), (0.1, 0.15, -0.2))
     settings = settings_from_camera(
         [[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], torch.eye(3), torch.zeros(3), size, size,
-        bg=tensor(np.zeros(1)), camera_model=model, distortion=distortion, rolling_shutter=shutter,
+        bg=first.new_zeros(1), camera_model=model, distortion=distortion, rolling_shutter=shutter,
         end=(last[:3, :3].T, last[3, :3]), low_pass=0.0)
-    full = (axes @ axes.transpose(0, 2, 1))[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
-    given = {"cov3D_precomp": tensor(full), "colors_precomp": tensor(np.ones((count, 1)))}
-    prints = project_gaussians(tensor(means), tensor(np.full(count, 0.5)), settings, **given)
-    assert (prints.radii > 0).all()
-    centres = prints.means2D.cpu().numpy()
-    xx, xy, yy = prints.conics.cpu().numpy().T
-    covariances = np.linalg.inv(np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2))
+    centres, covariances = projected(means, axes, settings)
 
     def seen(points):
         """Pixels of points, each by the pose of the row where it is then found."""
@@ -141,26 +114,15 @@ def test_footprints_are_those_of_brute_force(model, distortion, shutter):
             time = 1 - time if back else time
         return at, time
 
-    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
-    grid = np.stack(np.meshgrid(nodes, nodes, nodes), -1).reshape(-1, 3)
-    weight = np.prod(np.meshgrid(weights, weights, weights), 0).reshape(-1) / (2 * math.pi) ** 1.5
     errors, still_errors = [], []
     _, times = seen(means)
     for i in range(count):
-        points = means[i] + grid @ axes[i].T
-        image, _ = seen(points)
-        mean = weight @ image
-        covariance = (image - mean).T @ ((image - mean) * weight[:, None])
-        sigma = math.sqrt(np.linalg.eigvalsh(covariance)[-1])
+        mean, covariance, sigma = moments(seen(means[i] + GRID @ axes[i].T)[0])
         assert np.linalg.norm(mean - centres[i]) < 0.025 * sigma
-        errors.append(np.linalg.norm(covariance - covariances[i]) / np.linalg.norm(covariance))
-        view = first + float(times[i]) * (last - first)
-        still = settings._replace(viewmatrix=view, rolling_shutter="global", viewmatrix_end=None)
-        alone = project_gaussians(tensor(means[i:i + 1]), tensor([0.5]), still, **{
-            name: rows[i:i + 1] for name, rows in given.items()})
-        xx, xy, yy = alone.conics.cpu().numpy()[0]
-        still_errors.append(np.linalg.norm(covariance - np.linalg.inv([[xx, xy], [xy, yy]]))
-                            / np.linalg.norm(covariance))
+        errors.append(shape_error(covariances[i], covariance))
+        still = settings._replace(viewmatrix=first + float(times[i]) * (last - first), rolling_shutter="global",
+                                  viewmatrix_end=None)
+        still_errors.append(shape_error(projected(means[i:i + 1], axes[i:i + 1], still)[1][0], covariance))
     assert max(errors) < 0.01
     assert np.median(still_errors) > 0.05
 

@@ -35,7 +35,6 @@ struct Given : GaussianRasterizationSettings {
  private:
   void resolve_blend();
   void resolve_lens();
-  void resolve_shutter();
 };
 
 // For messages alone.
@@ -91,16 +90,20 @@ void Given::resolve_blend() {
   }
 }
 
-void Given::resolve_lens() {
-  const std::string& name = Settings::camera_model;
-  std::string names;
-  camera_model = -1;
-  for (int model = 0; model < kNumLensModels; ++model) {
-    if (name == kLensNames[model]) camera_model = model;
-    names += (model == 0 ? "" : ", ") + std::string(kLensNames[model]);
+// The place of a setting's value among its names.
+template <size_t kCount>
+int64_t number_of(const char* setting, const std::string& value, const char* const (&names)[kCount]) {
+  std::string all;
+  for (size_t i = 0; i < kCount; ++i) {
+    if (value == names[i]) return static_cast<int64_t>(i);
+    all += (i == 0 ? "" : ", ") + std::string(names[i]);
   }
-  TORCH_CHECK_VALUE(camera_model >= 0, "rasterize: camera_model is '", name, "'; it must be one of ", names);
-  resolve_shutter();
+  TORCH_CHECK_VALUE(false, "rasterize: ", setting, " is '", value, "'; it must be one of ", all);
+}
+
+void Given::resolve_lens() {
+  camera_model = number_of("camera_model", Settings::camera_model, kLensNames);
+  rolling_shutter = number_of("rolling_shutter", Settings::rolling_shutter, kShutterNames);
   if (camera_model == 0 && rolling_shutter != 0 && distortion.empty()) {
     TORCH_CHECK_VALUE(principal_point, "rasterize: principal_point is absent, but rolling_shutter is '",
                       Settings::rolling_shutter, "', with which projmatrix is not read; it must be given");
@@ -116,17 +119,6 @@ void Given::resolve_lens() {
   const auto principal = principal_point.value_or(centre);
   lens.assign(principal.begin(), principal.end());
   lens.insert(lens.end(), distortion.begin(), distortion.end());
-}
-
-void Given::resolve_shutter() {
-  const std::string& name = Settings::rolling_shutter;
-  std::string names;
-  rolling_shutter = -1;
-  for (int shutter = 0; shutter < kNumShutters; ++shutter) {
-    if (name == kShutterNames[shutter]) rolling_shutter = shutter;
-    names += (shutter == 0 ? "" : ", ") + std::string(kShutterNames[shutter]);
-  }
-  TORCH_CHECK_VALUE(rolling_shutter >= 0, "rasterize: rolling_shutter is '", name, "'; it must be one of ", names);
 }
 
 // The op's tensors in their order; absent ones are undefined.

@@ -1,9 +1,8 @@
 // What a pass over the pixels of a rendering is: it walks the tiles' lists once more, front to back, and reads no
 // features. csrc/cpu/tile_pass_impl.h and csrc/cuda/pass.cuh have the walks. A pass is a struct of S with its maps, and
 //
-//   arrays(visit, count)   visits what a caller gives, which must not be null: name, array, shape and number of
-//   elements,
-//                  0 where null will do. count: of the Gaussians
+//   arrays(visit, count)   visits what a caller gives: its name, array, shape, and number of elements. Where that is
+//                  above 0 the array must not be null. count: of the Gaussians
 //   State<Real>    what it knows of a pixel, or of a pack of pixels; `for_each` visits its kNum numbers
 //   begin<kMode>(pixel)   the State in front of all pairs; outside the image all its numbers are 0
 //   Sums<Real>     what it sums over the pixels of each Gaussian; `for_each` visits several Gaussians' side by side. Or
