@@ -39,7 +39,7 @@ def merged(shared: Row, row: Row) -> Row:
 
 
 def trainings() -> List[Row]:
-    """alpha, and smoe with a learned gate by the rule of covered pixels: by the recipe, and with a budget.
+    """alpha, and smoe with a learned gate by the rule of covered pixels: by 3DGS densification, and with a budget.
 
     A scene and budget whose blends do not have three seeds each with today's defaults of `importance` has earlier ones.
     """
@@ -116,7 +116,7 @@ def budget_table(rows: Sequence[Row]) -> str:
 
 
 def recipe_cells() -> Dict[Tuple[str, float], Dict[str, List[Row]]]:
-    """Rows of the recipe by scene and threshold, then by rule: "alpha", "smoe", "gate 0", "Eq. 7"."""
+    """Rows of 3DGS densification by scene and threshold, then by rule: "alpha", "smoe", "gate 0", "Eq. 7"."""
     rows = [row for row in trainings() if row["strategy"] == "3dgs"]
     found = {key: {blend: grouped(cells, "blend_mode")[blend,] for blend in BLENDS}
              for key, cells in grouped(rows, "scene", "densify_grad_threshold").items()}
@@ -147,7 +147,7 @@ def number_at(points: Sequence[Tuple[float, float]], psnr: float) -> Optional[fl
 
 
 def levels() -> List[Tuple[str, float, float, float]]:
-    """(scene, PSNR, Gaussians by alpha, by smoe) of the recipe."""
+    """(scene, PSNR, Gaussians by alpha, by smoe) by 3DGS densification."""
     cells = recipe_cells()
     found = []
     for scene, levels_of_scene in LEVELS.items():
@@ -179,7 +179,7 @@ def table_1() -> str:
     others = {row["label"] + f"{row['densify_grad_threshold']:g}": [row]
               for row in rows_of("captures_baselines_h200.jsonl")}
     budgets = grouped((row for row in rows if row["scene"] == "bonsai"), "blend_mode", "budget")
-    methods = {"3DGS (alpha, recipe)": [cells["bonsai", end]["alpha"] for end in (0.005, 0.0002)],
+    methods = {"3DGS (alpha)": [cells["bonsai", end]["alpha"] for end in (0.005, 0.0002)],
                "2DGS": [others["2dgs-unpatched0.005"], others["2dgs-unpatched0.0002"]],
                "Deformable Beta Splatting": [others["dbs-sparse0.0002"], others["dbs-dense0.0002"]],
                "smoe, the authors' program": [cells["bonsai", end]["gate 0"] for end in (0.005, 0.0002)],
@@ -293,7 +293,7 @@ RULES = {"alpha": "alpha", "learned": "smoe", "program": "the authors' program"}
 
 
 def timed() -> Dict[Tuple[str, str], Row]:
-    """Trainings by the recipe at 0.0002 that were alone on a card, by scene and rule."""
+    """Trainings by 3DGS densification at 0.0002 that were alone on a card, by scene and rule."""
     rows = [row for row in rows_of("paper_suites_h200.jsonl") if row["suite"] == "fig5"]
     return {(row["scene"], rule_of(row)): row for row in rows}
 
@@ -352,7 +352,7 @@ def race_table() -> str:
 
 
 def times_as_many(rows: Sequence[Row]) -> Dict[int, List[float]]:
-    """By budget of bonsai: how many times as many the recipe has in its row whose PSNR is next, smoe and alpha."""
+    """By budget of bonsai: how many times as many Gaussians 3DGS has in its row whose PSNR is next, smoe and alpha."""
     cells = grouped((row for row in rows if row["scene"] == "bonsai"), "blend_mode", "budget", "densify_grad_threshold")
     found: Dict[int, List[float]] = {}
     for blend, nearest in (("smoe", (0.005, 0.001, 0.0002)), ("alpha", (0.002, 0.001, 0.0002))):
@@ -364,9 +364,10 @@ def times_as_many(rows: Sequence[Row]) -> Dict[int, List[float]]:
 
 
 def rules_table() -> str:
-    """The recipe by Eq. 7 and by smoe without a gate."""
+    """3DGS densification by Eq. 7 and by smoe without a gate."""
     rows = [row for row in rows_of("tails_h100.jsonl") if row["strategy"] == "3dgs"]
-    columns = {"Eq. 7": ("smoe_eq7", 0), "Eq. 7, gate 0.03": ("smoe_eq7", 0.03), "smoe, λ = 0, all pairs": ("smoe", 0)}
+    columns = {"Eq. 7": ("smoe_eq7", 0), "Eq. 7, gate 0.03": ("smoe_eq7", 0.03),
+               "smoe, λ = 0, `faint_below` 2": ("smoe", 0)}
     lines = []
     for (scene, threshold), cells in grouped(rows, "scene", "densify_grad_threshold").items():
         by_rule = grouped(cells, "blend_mode", "background_gate")
@@ -398,20 +399,20 @@ def simplify_table() -> str:
                       f"{mean(kinds['own renderings', 'alpha'], 'psnr'):.2f}",
                       f"{mean(kinds['photographs', 'smoe'], 'psnr'):.2f}", f"{mean(alpha, 'train_seconds'):.1f}",
                       f"{mean(alpha, 'bytes') / 1e6:.1f}, {spz / 1e6:.1f}"])
-    return table(["model by the recipe", "to", "PSNR, SSIM", "own renderings", "`smoe`", "s", "MB as `.ply`, `.spz`"],
-                 lines)
+    return table(["model by 3DGS densification", "to", "PSNR, SSIM", "own renderings", "`smoe`", "s",
+                  "MB as `.ply`, `.spz`"], lines)
 
 
 def presets_table() -> str:
-    """The recipe, the default and --best, of one seed."""
-    columns = {"recipe": "--strategy 3dgs", "default": "none", "`--best`": "--best"}
+    """3DGS densification, the default and --best, of one seed."""
+    columns = {"3DGS densification": "--strategy 3dgs", "default": "none", "`--best`": "--best"}
     cells = grouped((row for row in rows_of("presets_h200.jsonl") if not row["alone"]), "scene", "blend_mode")
     lines = []
     for (scene, blend), rows in sorted(cells.items(), key=lambda item: (SCENES.index(item[0][0]), item[0][1])):
         found = {row["options"]: f"{row['psnr']:.2f}, {row['ssim']:.3f}, "
                  + ("–" if row["lpips_alex"] is None else f"{row['lpips_alex']:.3f}") + f"; {thousands([row])}"
                  for row in rows}
-        if columns["recipe"] in found:  # else there is nothing beside it
+        if columns["3DGS densification"] in found:  # else there is nothing beside it
             lines.append([f"{scene}, {blend}", *(found.get(options, "–") for options in columns.values())])
     return table(["PSNR, SSIM, LPIPS; Gaussians", *columns], lines)
 
