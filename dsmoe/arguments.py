@@ -21,7 +21,7 @@ TRAIN_EXAMPLES = """examples:
   dsmoe train garden -o small --blend-mode smoe --budget 30000    30,000 Gaussians
   dsmoe train garden -o fast --fast                               in seconds on a GPU
   dsmoe train garden -o quick --fast --resolution 4               in minutes on a processor
-  dsmoe train garden -o recipe --strategy 3dgs                    the recipe of 3DGS"""
+  dsmoe train garden -o dense --strategy 3dgs                     the densification of 3DGS"""
 
 
 # Options of a training that `dsmoe simplify` offers as they are.
@@ -49,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_paper(groups["blending"])
     groups["length, and number of Gaussians"].add_argument(
         "--scale-recipe", action="store_true",
-        help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
+        help="squeeze the schedule into --iterations: milestones (densification, resets, learning rate, SH degrees) "
              "keep their share of 30,000 steps, unless they are given; importance does so by itself")
     presets = groups["length, and number of Gaussians"].add_mutually_exclusive_group()
     presets.add_argument(
@@ -281,7 +281,7 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("--device", choices=choices.DEVICES,
                      help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
     run.add_argument("--iterations", type=whole_number, metavar="N",
-                     help="a trial: so many iterations, with the recipe squeezed into them; not for checkouts")
+                     help="a trial: so many iterations, with the schedule squeezed into them; not for checkouts")
     run.add_argument("--scenes", metavar="SCENES",
                      help=f"in place of the suite's: a .yaml file, or a shipped one: {', '.join(sorted(SCENES))}")
     run.add_argument("--jobs", type=whole_number, metavar="N",

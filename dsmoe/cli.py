@@ -211,8 +211,8 @@ def _train_in(group: Group, config: TrainConfig, layout: Optional[Layout], argum
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
     if config.strategy == STRATEGY and not arguments.resume and not getattr(arguments, "budget", 0):
         whose = "that of the model" if config.init else "chosen for the scene"
-        print(f"note: that number is {whose}; --budget N makes more or fewer, and --strategy 3dgs is the recipe of "
-              "3DGS")
+        print(f"note: that number is {whose}; --budget N makes more or fewer, and --strategy 3dgs is the "
+              "densification of 3DGS")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,

@@ -117,9 +117,9 @@ class TrainConfig:
         0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed (default: importance chooses it "
            "for the scene)")
     strategy: Optional[str] = _option(
-        None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
-              "prune; importance: grow beyond the budget, remove what changes the images least, move the rest to where "
-              "the error is; mcmc: relocation and noise (default: importance)",
+        None, "how Gaussians are added and removed. 3dgs: the original densification; steady: no opacity reset and no "
+              "size prune; importance: grow beyond the budget, remove what changes the images least, move the rest to "
+              "where the error is; mcmc: relocation and noise (default: importance)",
         choices=STRATEGY_NAMES)
     strategy_options: str = _option("", "settings of `importance`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")

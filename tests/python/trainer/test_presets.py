@@ -71,7 +71,7 @@ def test_without_options_importance_takes_a_number_that_the_scene_says(tiny_scen
     assert main(["train", tiny_scene, "-o", output, *words, *none]) == 0
     said, config = capsys.readouterr().out, TrainConfig.load(output)
     assert "strategy importance to 288 Gaussians" in said, "two for each of the 144 points"
-    assert "--budget N makes more or fewer, and --strategy 3dgs is the recipe of 3DGS" in said
+    assert "--budget N makes more or fewer, and --strategy 3dgs is the densification of 3DGS" in said
     assert (config.strategy, config.densify_until_iter) == ("importance", 15)
     assert results_of(output)[0]["num_gaussians"] == 288
     for more in ([tiny_scene, *words], []):
