@@ -527,7 +527,8 @@ def sentences() -> Dict[str, List[str]]:
             f"{span(many[10_000], 1)} times as many", f"{slower_fps['learned']} % slower",
             f"{slower_fps['program']} % slower", f"trains {longer} % longer",
             f"30.0 dB after {both('to 30.0', 1)} s (alpha and smoe), 31.5 dB after {both('to 31.5', 1)} s, and ends "
-            f"after {both('train_seconds', 1)} s with {both('psnr', 2)} dB",
+            f"after {both('train_seconds', 1)} s with {both('psnr', 2)} dB"],
+        "docs/trainer.md": [
             f"On fox the default is {on_fox['--strategy 3dgs'] - on_fox['none']:.1f} dB behind",
             f"has {fast_fox:.2f} dB with as many, `--budget 13700` "
             f"{mean(by_budget['fox', 13700]['alpha',], 'psnr'):.2f}"],

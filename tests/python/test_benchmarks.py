@@ -158,7 +158,8 @@ def test_the_tables_of_the_pages_are_those_of_the_rows():
                        ("RESULTS.md", tables.table_2()),
                        ("RESULTS.md", tables.time_table()), ("RESULTS.md", tables.transmittance_table()),
                        ("RESULTS.md", tables.race_table()), ("NOTES.md", tables.rules_table()),
-                       ("RESULTS.md", tables.presets_table()), ("../docs/simplify.md", tables.simplify_table())):
+                       ("../docs/trainer.md", tables.presets_table()),
+                       ("../docs/simplify.md", tables.simplify_table())):
         with open(os.path.join(BENCHMARKS, page), encoding="utf-8") as file:
             assert text in file.read(), f"{page}: `python benchmarks/tables.py` prints another table:\n{text}"
 
