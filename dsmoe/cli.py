@@ -12,10 +12,9 @@ from .arguments import build_parser, completion_script
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .options.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from .options.config_arguments import config_from_arguments, given_options, take_paper
-from .options.early import check_early
+from .options.early import check_cameras, check_early
 from .options.presets import STRATEGY
 from .patches import PatchError
-from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
 from .system.process import command
 
@@ -234,6 +233,7 @@ def _simplify(arguments: argparse.Namespace) -> None:
     from .simplify import simplify
     from .system.process import set_up_process
 
+    take_paper(arguments)
     arguments.device = getattr(arguments, "device", "auto")
     _choose_device(arguments)
     set_up_process(arguments.device)
@@ -346,7 +346,7 @@ def _with_lpips(net: str, device: str) -> Measure:
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .inspection import render_images
+    from .inspection import config_of_model, render_images
 
     _choose_device(arguments)
     overrides = _overrides(arguments)
@@ -354,10 +354,11 @@ def _render(arguments: argparse.Namespace) -> None:
     if arguments.orbit:
         _render_orbit(arguments, overrides, outputs)
         return
-    if is_folder(arguments.source):
-        config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
+    if holds_run(arguments.model):
+        config, ply = TrainConfig.of_run(arguments.model, "--scene", **overrides), None
     else:
-        config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
+        config, ply = config_of_model(arguments.model, **overrides)
+        check_cameras(arguments.model, config.scene)
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
                           background_gate=arguments.background_gate, outputs=outputs,
                           overwrite=arguments.overwrite)
@@ -368,7 +369,7 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
     from .filming import film
     from .inspection import open_trained
 
-    trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
+    trained = open_trained(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
                            **overrides)
     print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
 
@@ -385,7 +386,7 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.bake:
         _choose_device(arguments)
     with PromptInterrupt():
-        path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
+        path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
                                arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
                                bake=arguments.bake, bake_iterations=arguments.bake_iterations,
                                device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
@@ -399,7 +400,7 @@ def _view(arguments: argparse.Namespace) -> None:
     from .view.server import Viewer
 
     _choose_device(arguments)
-    viewer = Viewer(Followed(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
+    viewer = Viewer(Followed(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
                              **_overrides(arguments)), arguments.host, arguments.port)
     print(f"{viewer.address}/?darkMode: open it in a browser; Ctrl-C ends", flush=True)
     viewer.wait()

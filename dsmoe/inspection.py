@@ -12,8 +12,7 @@ from PIL import Image
 
 from .errors import TrainerError, printable
 from .model import GaussianModel
-from .options.config import CHECKPOINT_NAME, LEARNED, TrainConfig
-from .options.early import check_source
+from .options.config import CHECKPOINT_NAME, LEARNED, TrainConfig, holds_run
 from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, model_path
@@ -24,6 +23,7 @@ from .results.video import check_folder
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
+from .starting import find_model
 from .system.device import check_device
 from .system.files import is_file, is_folder, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
@@ -83,7 +83,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
 
 def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str], device: str,
                   rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
-    """A renderer for a .ply with the blend mode and the background gate that it records.
+    """A renderer for a file of a model with the blend mode and the background gate that it records.
 
     config gives background and antialiasing. Raises TrainerError if what is asked disagrees with the file.
     """
@@ -98,7 +98,7 @@ class OpenedRun(NamedTuple):
     """The model of a run."""
 
     renderer: Renderer
-    path: str  # its .ply, or the checkpoint
+    path: str  # of its Gaussians, or the checkpoint
     so_far: Optional[SoFar]  # what the checkpoint holds, if the training has not ended
 
 
@@ -220,8 +220,8 @@ def to_image(color: torch.Tensor) -> Image.Image:
 class Trained:
     """An opened model."""
 
-    config: TrainConfig  # the run's; of a .ply only background, resolution and scene mean something
-    path: str  # the .ply; of a training that has not ended, the checkpoint
+    config: TrainConfig  # the run's; of another model only what says how its scene is loaded means something
+    path: str  # the file; of a training that has not ended, the checkpoint
     renderer: Renderer
     cameras: List[Camera]  # the scene's test views, else its training views, upright; one on the orbit without a scene
     orbit: Orbit
@@ -230,22 +230,32 @@ class Trained:
 
 def open_trained(source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
                  device: str = "cpu", **options: Any) -> Trained:
-    """Opens the output folder of `dsmoe train`, before its end the checkpoint in it, or a .ply.
+    """Opens a model as `find_model` finds it; of a training that has not ended, its checkpoint.
 
-    blend_mode, background_gate: of a .ply that does not record them (else alpha); they must agree if something does.
+    blend_mode, background_gate: of a file that does not record them (else alpha); they must agree if something does.
     options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. There are none if the
     run's scene is not there. Raises TrainerError.
     """
     check_device(device)
-    check_source(source)
-    if is_folder(source):
+    so_far = None
+    if holds_run(source):
         config = TrainConfig.load(source).changed(**options)
         renderer, path, so_far = open_run(config, blend_mode, background_gate, device)
     else:
-        config, path, so_far = TrainConfig(blend_mode="alpha", **options).validate(), source, None
+        config, path = config_of_model(source, **options)
         renderer = open_renderer(config, path, blend_mode, device, asked_gate=background_gate)
     cameras, orbit = places(config, renderer.model, needed="scene" in options)
     return Trained(config, path, renderer, cameras, orbit, so_far is None)
+
+
+def config_of_model(source: str, **options: Any) -> Tuple[TrainConfig, str]:
+    """Of a model that is no run: what its folder knows of its scene, with some options set, and its file.
+
+    Raises TrainerError.
+    """
+    found = find_model(source)
+    known = found.options_on(options.get("scene", ""))
+    return TrainConfig(**{"blend_mode": "alpha", **known, **options}).validate(), found.path
 
 
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:

@@ -22,7 +22,7 @@ from diff_smoe_rasterization.settings import (
 
 from ..errors import ConfigError
 from ..system.files import is_file, is_folder, write_text_atomically
-from .choices import DEVICES, LENSES
+from .choices import DEVICES, LENSES, MODEL
 from .importance_options import ImportanceOptions, parse_importance_options
 
 CONFIG_NAME = "config.json"
@@ -110,9 +110,8 @@ class TrainConfig:
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
     init: str = _option(
-        "", "start from the Gaussians of a model, in place of the scene's points: a .ply, .splat, .spz or .glb, an "
-            "output folder of `dsmoe train` or a model folder of 3DGS. --blend-mode is then the model's by default",
-        metavar="MODEL")
+        "", f"start from the Gaussians of a model, in place of the scene's points: {MODEL}. --blend-mode is then the "
+            "model's by default", metavar="MODEL")
     budget: int = _option(
         0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed (default: importance chooses it "
            "for the scene)")

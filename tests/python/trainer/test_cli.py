@@ -201,7 +201,7 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         "simplify|nowhere|-o|o|--budget|9": "nowhere: no such file or folder; name a .ply, .splat",
         "scene|nowhere|-o|o": "no such folder of photographs", "eval|nowhere": "nowhere: no such folder",
         f"eval|{tmp_path}": "holds no config.json", "render|nowhere|-o|o": "no such file or folder",
-        f"render|{ply}|-o|o": "a .ply holds no cameras", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
+        f"render|{ply}|-o|o": f"{ply} holds no cameras", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
         f"render|{ply}|-o|o|--scene|nowhere": "scene nowhere: no such folder", "view|nowhere": "no such file or folder",
         "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it"}
     listed = {"": "measure a trained run again", "patch": "take the patch out of every file",
@@ -583,7 +583,7 @@ def test_a_model_of_the_papers_authors_is_rendered_by_smoe_with_the_gate_0(train
     assert not np.array_equal(rendered("smoe"), rendered("smoe_eq7")), "the two rules show different images"
     nowhere = ["-o", str(tmp_path / "no")]
     assert "authors' program" in fails(capsys, "render", str(ply), "--scene", scene, "--blend-mode", "smoe", *nowhere)
-    assert "name the .ply" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)
+    assert "out-temp holds no cameras; name" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)
 
 
 @pytest.mark.parametrize("mode, gate, warns", [
@@ -697,7 +697,7 @@ def test_errors_come_before_anything_is_written(scene, tmp_path, capsys):
     assert "--scene" in fails(capsys, "render", "model.ply", "-o", output)
     for words in (["view", "model.ply"], ["export", "model.ply"], ["render", "model.ply", "-o", output, "--orbit"]):
         said = fails(capsys, *words)
-        assert "model.ply: no such file or folder; name the output folder of `dsmoe train`, or a .ply" in said
+        assert "model.ply: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of" in said
     assert "model.ply" in fails(capsys, "render", "model.ply", "-o", output, "--scene", scene)
 
 
