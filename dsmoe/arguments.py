@@ -92,8 +92,8 @@ def build_parser() -> argparse.ArgumentParser:
     scene.add_argument("--camera-model", choices=choices.CAMERA_MODELS, default=choices.CAMERA_MODEL,
                        help="of the lens, by COLMAP's names (default: %(default)s)")
     scene.add_argument("--fov", type=number, metavar="DEGREES",
-                       help="about how much a photograph shows along its longer side: COLMAP starts from it (default: "
-                            "what the photographs record; else 150 of a fisheye, 48 of others)")
+                       help="about how much a photograph shows along its longer side, whatever it records: COLMAP "
+                            "starts from it (default: what they record; else 150 of a fisheye, 48 of others)")
     scene.add_argument("--lenses", choices=choices.LENSES, default=choices.LENSES[0],
                        help="undistort: images of a pinhole camera; native: the photographs as they are, with the lens "
                             "that was found; auto: native where undistortion would cut off more than a tenth of a "

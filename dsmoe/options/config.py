@@ -340,9 +340,7 @@ class TrainConfig:
         if not holds_run(folder):
             runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
             raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
-                              + (f"; such are {', '.join(runs[:3])}" if runs else "")
-                              + ("; of another trainer's model name the .ply" if is_file(
-                                  os.path.join(folder, "cfg_args")) else ""))
+                              + (f"; such are {', '.join(runs[:3])}" if runs else ""))
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
