@@ -17,7 +17,7 @@ from diff_smoe_rasterization.settings import GATED_MODES, trained_faint_below
 
 from .errors import ConfigError, TrainerError
 from .model import GaussianModel, finite_rows
-from .options.config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of
+from .options.config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of, runs_below
 from .options.early import check_model
 from .results.evaluation import evaluate
 from .results.modelfile import (
@@ -147,7 +147,7 @@ def find_model(source: str) -> Found:
     path = latest_model(source)
     if not path:
         raise TrainerError(f"{source}: no model is in it: neither {CONFIG_NAME} of `dsmoe train` nor point_cloud/"
-                           "iteration_N/point_cloud.ply of 3DGS")
+                           "iteration_N/point_cloud.ply of 3DGS" + runs_below(source))
     options = _options_of_3dgs(source)
     missing = "" if is_folder(options.get("scene", "")) else options.pop("scene", "")
     return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {}, missing)

@@ -338,9 +338,8 @@ class TrainConfig:
         if not is_folder(folder):
             raise ConfigError(f"{folder}: no such folder; name the output folder of `dsmoe train`")
         if not holds_run(folder):
-            runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
             raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
-                              + (f"; such are {', '.join(runs[:3])}" if runs else ""))
+                              + runs_below(folder))
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
@@ -430,6 +429,12 @@ def _set_by(names: Sequence[str], chosen: Any) -> Dict[str, Any]:
 def holds_run(folder: str) -> bool:
     """Whether OUT/config.json is there. Raises TrainerError if that cannot be seen."""
     return is_file(os.path.join(folder, CONFIG_NAME))
+
+
+def runs_below(folder: str) -> str:
+    """What an error says of runs in the folder, where one was looked for."""
+    runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
+    return f"; such are {', '.join(runs[:3])}" if runs else ""
 
 
 def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
