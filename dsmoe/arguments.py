@@ -248,6 +248,8 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
                         help="of a file that does not record it (default: alpha); must agree where it does")
     parser.add_argument("--background-gate", type=number, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
+    parser.add_argument("--faint-below", type=number, metavar="X", help="likewise (default: 0.25 in smoe)")
+    _add_paper(parser)
     parser.add_argument("--white-background", action="store_true", default=None,
                         help="white background (default: the run's, else black)")
 

@@ -46,6 +46,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     if unknown:  # argparse would show the usage of `dsmoe` alone
         _refuse(unknown, getattr(arguments, "command_parser", parser))
     try:
+        take_paper(arguments)
         check_early(arguments)
         status = COMMANDS[arguments.command](arguments) or 0
         sys.stdout.flush()
@@ -147,7 +148,6 @@ def _run(arguments: argparse.Namespace) -> None:
     from .patches.run import run
 
     words = arguments.words[1:] if arguments.words[:1] == ["--"] else arguments.words
-    take_paper(arguments)
     if not arguments.blend_mode:
         arguments.command_parser.error("--blend-mode MODE or --paper is needed")
     run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate, arguments.faint_below)
@@ -233,7 +233,6 @@ def _simplify(arguments: argparse.Namespace) -> None:
     from .simplify import simplify
     from .system.process import set_up_process
 
-    take_paper(arguments)
     arguments.device = getattr(arguments, "device", "auto")
     _choose_device(arguments)
     set_up_process(arguments.device)
@@ -261,7 +260,6 @@ def _simplify(arguments: argparse.Namespace) -> None:
 
 def _train_config(arguments: argparse.Namespace) -> Tuple[TrainConfig, Optional[Layout]]:
     """The options of a training: those that are given, and for --resume the run's own; the scene's layout if read."""
-    take_paper(arguments)
     given = given_options(arguments)
     if arguments.resume and set(given) & {"scene", "output"} == {"scene"}:  # dsmoe train --resume OUT
         given["output"] = arguments.output = given.pop("scene")
@@ -361,7 +359,7 @@ def _render(arguments: argparse.Namespace) -> None:
         check_cameras(arguments.model, config.scene)
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
                           background_gate=arguments.background_gate, outputs=outputs,
-                          overwrite=arguments.overwrite)
+                          overwrite=arguments.overwrite, faint_below=arguments.faint_below)
     print(f"{len(paths)} images in {arguments.output}")
 
 
@@ -370,7 +368,7 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
     from .inspection import open_trained
 
     trained = open_trained(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
-                           **overrides)
+                           arguments.faint_below, **overrides)
     print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
 
 
@@ -389,7 +387,8 @@ def _export(arguments: argparse.Namespace) -> None:
         path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
                                arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
                                bake=arguments.bake, bake_iterations=arguments.bake_iterations,
-                               device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
+                               device=arguments.device if arguments.bake else "cpu", faint_below=arguments.faint_below,
+                               **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)
@@ -401,7 +400,7 @@ def _view(arguments: argparse.Namespace) -> None:
 
     _choose_device(arguments)
     viewer = Viewer(Followed(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
-                             **_overrides(arguments)), arguments.host, arguments.port)
+                             arguments.faint_below, **_overrides(arguments)), arguments.host, arguments.port)
     print(f"{viewer.address}/?darkMode: open it in a browser; Ctrl-C ends", flush=True)
     viewer.wait()
 

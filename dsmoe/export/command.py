@@ -17,6 +17,7 @@ from ..results.glb import BLEND, Blend, glb_bytes
 from ..results.modelfile import read_gaussians, save_model
 from ..results.pictures import evenly_spaced
 from ..results.rows import blend_name, viewer_warning
+from ..results.shown import FAINT_BELOW
 from ..results.splat import splat_bytes
 from ..results.spz import check_spz, spz_bytes
 from ..system.files import check_output, is_folder, new_file, write_atomically
@@ -115,9 +116,12 @@ def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: 
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
     recorded: Dict[str, Any] = {"blend_mode": mode,
                                 "background_gate": float(gate) if mode in GATED_MODES else None}
-    others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # of an older name
+    known = (*recorded, FAINT_BELOW)  # also of an older name
+    others = [line for line in gaussians.comments if line.split(" ")[0] not in known]
+    if trained.renderer.faint_below is not None:
+        others.append(f"{FAINT_BELOW} {trained.renderer.faint_below:g}")
     with new_file(path, overwrite) as temporary:
-        io.write_gaussians(temporary, dataclasses.replace(gaussians, comments=others, **recorded))
+        io.write_gaussians(temporary, dataclasses.replace(gaussians, comments=tuple(others), **recorded))
 
 
 def _shown(trained: Trained) -> html.Shown:

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import argparse
-import copy
 import os
 from typing import Optional
 
@@ -10,7 +9,7 @@ from ..errors import SceneError, TrainerError
 from ..system.files import check_output, is_file, is_folder
 from .choices import MODEL
 from .config import TrainConfig, holds_run
-from .config_arguments import given_options, take_paper
+from .config_arguments import given_options
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 FROM_VIDEO = "of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
@@ -26,7 +25,6 @@ def check_early(arguments: argparse.Namespace) -> None:
         check_scene(scene)
         _check_options(arguments)
     elif command == "simplify":
-        take_paper(copy.copy(arguments))
         check_model(arguments.model)
     elif command == "eval":
         TrainConfig.load(arguments.output)
@@ -49,8 +47,6 @@ def _check_options(arguments: argparse.Namespace) -> None:
     if getattr(arguments, "init", ""):
         check_model(arguments.init)
         return  # that model says how it is blended
-    arguments = copy.copy(arguments)
-    take_paper(arguments)
     given = {**given_options(arguments), "device": "cpu", "strategy": "steady", "strategy_options": ""}
     if "iterations" not in given:  # a preset has its own, and --batch divides them
         given.pop("batch", None)

@@ -11,6 +11,7 @@ from diff_smoe_rasterization.settings import (
     GATED_MODES,
     resolve_background_gate,
     resolve_faint_below,
+    trained_faint_below,
 )
 
 from ..errors import TrainerError, printable
@@ -140,8 +141,22 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
                            "with another one its Gaussians show another scene")
     if gate is None and asked is None:
         raise TrainerError(f"{path} does not say which background gate it was trained with; pass "
-                           "--background-gate, which is 0 for the paper's Eq. 7 and for models of its authors' program")
+                           "--background-gate, which is 0 for the paper's Eq. 7, or --paper for a model of its "
+                           "authors' program")
     try:
         return float(resolve_background_gate(blend_mode, asked if gate is None else gate))
+    except ValueError as error:
+        raise TrainerError(str(error)) from error
+
+
+def agreed_faint_below(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> Optional[float]:
+    """The `faint_below` to render a file with, None as usual: by the rules of `agreed_blend_mode`."""
+    known = trained_faint_below(blend_mode, recorded.faint_below)
+    if asked in (None, known):
+        return recorded.faint_below
+    if recorded.blend_mode is not None or recorded.faint_below is not None or blend_mode not in GATED_MODES:
+        raise TrainerError(f"{path}: in the blend mode {blend_mode} its faint_below is {known:g}, not {asked:g}")
+    try:
+        return resolve_faint_below(blend_mode, asked)
     except ValueError as error:
         raise TrainerError(str(error)) from error

@@ -25,9 +25,9 @@ class Followed:
     progress: str  # of a training, in words
 
     def __init__(self, source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
-                 device: str = "cpu", **options: Any) -> None:
+                 device: str = "cpu", faint_below: Optional[float] = None, **options: Any) -> None:
         """Arguments as in `open_trained`. Raises TrainerError, also if a run has no checkpoint yet."""
-        self._arguments = (source, blend_mode, background_gate, device)
+        self._arguments = (source, blend_mode, background_gate, device, faint_below)
         self._options = options
         self._config: Optional[TrainConfig] = None  # of the run that is shown
         self._seen: Optional[Tuple[str, int]] = None  # the file that is shown, and when it was written
@@ -71,7 +71,7 @@ class Followed:
         self.progress = ""
 
     def _take_checkpoint(self, config: TrainConfig) -> None:
-        device = self._arguments[-1]
+        device = self._arguments[3]
         so_far = made_so_far(config, device)
         renderer = Renderer(so_far.model, str(config.blend_mode), background_color(config.white_background, device),
                             config.antialiasing, background_gate=so_far.background_gate,

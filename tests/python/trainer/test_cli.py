@@ -548,6 +548,8 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
         place = [] if source == trained else ["--scene", scene]
         text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--background-gate", "0.5")
         assert f"gate {GATE}, not 0.5" in text
+        text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--faint-below", "0.5")
+        assert "in the blend mode smoe_eq7 its faint_below is 2, not 0.5" in text
     text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe_eq7")
     assert "bare.ply" in text and "--background-gate" in text
     assert "gate 0.0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
@@ -581,6 +583,9 @@ def test_a_model_of_the_papers_authors_is_rendered_by_smoe_with_the_gate_0(train
         return np.asarray(Image.open(os.path.join(folder, "view_000.png")))
 
     assert not np.array_equal(rendered("smoe"), rendered("smoe_eq7")), "the two rules show different images"
+    assert main(["render", str(ply), "--scene", scene, "--paper", "-o", str(tmp_path / "program")]) == 0
+    program = np.asarray(Image.open(tmp_path / "program" / "view_000.png"))
+    assert not np.array_equal(program, rendered("smoe")), "all pairs count in it"
     nowhere = ["-o", str(tmp_path / "no")]
     assert "authors' program" in fails(capsys, "render", str(ply), "--scene", scene, "--blend-mode", "smoe", *nowhere)
     assert "out-temp holds no cameras; name" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)

@@ -14,6 +14,7 @@ from dsmoe.cli import main
 from dsmoe.inspection import open_trained, to_image
 from dsmoe.options.config import TrainConfig
 from dsmoe.results.glb import glb_bytes
+from dsmoe.results.modelfile import load_model
 from dsmoe.scenes.scene import load_scene
 from dsmoe.view.following import Followed
 
@@ -61,22 +62,28 @@ def test_every_format_is_rendered_exported_and_viewed(model, tiny_scene, tmp_pat
 
 
 @pytest.mark.parametrize("ending", ENDINGS[:3])
-def test_a_file_without_a_record_is_declared_by_the_options(model, tiny_scene, tmp_path, capsys, ending):
-    """A .glb always says how it is blended."""
+@pytest.mark.parametrize("words, blend", [
+    (["--blend-mode", "smoe", "--background-gate", "0.25"], ("smoe", 0.25, None)), (["--paper"], ("smoe", 0, 2))])
+def test_a_file_without_a_record_is_declared_by_the_options(model, tiny_scene, tmp_path, capsys, ending, words, blend):
+    """A .glb always says how it is blended. None: as usual."""
     path, declared = exported(model, tmp_path, ending), str(tmp_path / "declared.ply")
-    smoe = ["--blend-mode", "smoe", "--background-gate", "0.25"]
-    assert main(["export", path, "-o", declared, *smoe]) == 0
-    stored = io.read_gaussians(declared)
-    assert (stored.blend_mode, stored.background_gate) == ("smoe", 0.25)
-    for name, words in (("images", [path, *smoe]), ("same", [declared])):
-        assert main(["render", *words, "--scene", tiny_scene, "-o", str(tmp_path / name)]) == 0
-    image = os.listdir(tmp_path / "images")[-1]
-    assert (tmp_path / "images" / image).read_bytes() == (tmp_path / "same" / image).read_bytes()
-    viewed = Followed(path, "smoe", 0.25).renderer
-    assert (viewed.blend_mode, viewed.background_gate) == ("smoe", 0.25)
-    capsys.readouterr()
-    assert main(["render", path, "--scene", tiny_scene, "-o", str(tmp_path / "no"), *smoe[:2]]) == 1
-    assert f"{path} does not say which background gate it was trained with; pass" in capsys.readouterr().err
+    assert main(["export", path, "-o", declared, *words]) == 0
+    assert load_model(declared, "cpu")[1] == blend
+    for name, source in (("images", [path, *words]), ("same", [declared])):
+        assert main(["render", *source, "--scene", tiny_scene, "-o", str(tmp_path / name)]) == 0
+    one, same = ((tmp_path / name / "view_000.png").read_bytes() for name in ("images", "same"))
+    assert one == same
+    viewed = Followed(path, blend[0], blend[1], faint_below=blend[2]).renderer
+    assert (viewed.blend_mode, viewed.background_gate, viewed.faint_below) == blend
+    for source, wrong, said in (
+            (path, ["--blend-mode", "smoe"], f"{path} does not say which background gate it was trained with; pass"),
+            (declared, ["--faint-below", "0.5"], f"its faint_below is {blend[2] or 0.25:g}, not 0.5"),
+            (path, ["--faint-below", "0.5"], "in the blend mode alpha its faint_below is 2, not 0.5"),
+            (path, ["--paper", "--faint-below", "0.5"], "--faint-below is 0.5; with --paper it is 2"),
+            (path, ["--blend-mode", "smoe", "--background-gate", "0", "--faint-below", "-1"], "faint_below is -1")):
+        capsys.readouterr()
+        assert main(["render", source, "--scene", tiny_scene, "-o", str(tmp_path / "no"), *wrong]) == 1
+        assert said in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
 def test_a_glb_is_of_alpha_unless_it_says_otherwise(model, tmp_path, capsys):
