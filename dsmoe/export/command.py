@@ -78,7 +78,7 @@ def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str
                  run=config if config.output else None)
     ply = os.path.join(folder, "baked.ply")
     save_model(ply, baked.renderer.model, baked.renderer.blend_mode, 1.0)
-    name = blend_name(before.blend_mode, float(before.background_gate))
+    name = blend_name(before.blend_mode, float(before.background_gate), before.faint_below)
     note = "the scene has no test images: what the baking costs was not measured"
     if baked.trained is not None:
         note = (f"test PSNR: {baked.trained:.2f} dB in {name}, {baked.shown:.2f} dB when viewers blend that by alpha, "
