@@ -92,8 +92,8 @@ def build_parser() -> argparse.ArgumentParser:
     scene.add_argument("--camera-model", choices=choices.CAMERA_MODELS, default=choices.CAMERA_MODEL,
                        help="of the lens, by COLMAP's names (default: %(default)s)")
     scene.add_argument("--fov", type=number, metavar="DEGREES",
-                       help="about how much a photograph shows along its longer side: COLMAP starts from it (default: "
-                            "what the photographs record; else 150 of a fisheye, 48 of others)")
+                       help="about how much a photograph shows along its longer side, whatever it records: COLMAP "
+                            "starts from it (default: what they record; else 150 of a fisheye, 48 of others)")
     scene.add_argument("--lenses", choices=choices.LENSES, default=choices.LENSES[0],
                        help="undistort: images of a pinhole camera; native: the photographs as they are, with the lens "
                             "that was found; auto: native where undistortion would cut off more than a tenth of a "
@@ -110,9 +110,9 @@ def build_parser() -> argparse.ArgumentParser:
                                "torchmetrics downloads them")
     _add_device(evaluate)
 
-    render = commands.add_parser("render", help="write images or a video of a trained run or a .ply",
+    render = commands.add_parser("render", help="write images or a video of a trained model",
                                  description="Writes one PNG for every camera of a scene, or a video around it.")
-    render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+    render.add_argument("model", metavar="MODEL", help=choices.MODEL)
     render.add_argument("-o", "--output", metavar="DIR|VIDEO", required=True,
                         help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
                              "that ends in .mp4 (needs imageio-ffmpeg), .gif or .webp")
@@ -123,11 +123,11 @@ def build_parser() -> argparse.ArgumentParser:
                         help=f"of a video (default: {choices.VIDEO_FPS:g})")
     render.add_argument("--split", choices=("test", "train", "all"), default="test",
                         help="which cameras (default: test)")
-    _add_model_options(render, "whose cameras are rendered (default: the run's; needed for a .ply)")
+    _add_model_options(render, "whose cameras are rendered (default: as the model's folder says)")
     render.add_argument("--resolution", type=whole_number, metavar="N",
-                        help="as in train (default: the run's, for a .ply -1)")
+                        help="as in train (default: the run's, else -1)")
     render.add_argument("--principal-point", choices=PRINCIPAL_POINTS,
-                        help="as in train (default: the run's, for a .ply scene)")
+                        help="as in train (default: the run's, else scene)")
     render.add_argument("--depth", action="store_true",
                         help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
     render.add_argument("--alpha", action="store_true",
@@ -140,7 +140,7 @@ def build_parser() -> argparse.ArgumentParser:
                                  description="Writes a trained model as one file. A page (.html) shows it in a "
                                              "browser by the blend that it was trained with; other viewers show the "
                                              "other formats by alpha.")
-    export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+    export.add_argument("model", metavar="MODEL", help=choices.MODEL)
     export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
     export.add_argument("--format", choices=choices.EXPORT_FORMATS,
                         help=f"default: by the ending of FILE, else {choices.EXPORT_FORMATS[0]}; spz needs gsply")
@@ -158,8 +158,8 @@ def build_parser() -> argparse.ArgumentParser:
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
                                description="Serves a live viewer of a run's model, of the checkpoints of a training "
-                                           "that goes on, or of a .ply. It needs viser.")
-    view.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+                                           "that goes on, or of a file. It needs viser.")
+    view.add_argument("model", metavar="MODEL", help=choices.MODEL)
     _add_model_options(view, "at whose first test view it begins (default: the run's)")
     view.add_argument("--host", default=choices.VIEW_HOST,
                       help="address to serve at; 0.0.0.0: to the network too (default: %(default)s, this machine only)")
@@ -207,9 +207,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_simplify_arguments(simplify: argparse.ArgumentParser) -> None:
-    simplify.add_argument("model", metavar="MODEL",
-                          help="a .ply, .splat, .spz or .glb, an output folder of `dsmoe train`, or a model folder of "
-                               "3DGS")
+    simplify.add_argument("model", metavar="MODEL", help=choices.MODEL)
     simplify.add_argument("-o", "--output", metavar="OUT", required=True, help="folder to write, as of `dsmoe train`")
     simplify.add_argument("--scene", help="folder of the photographs (default: as the model's folder says; if it is "
                                           "not there, the images are the model's renderings at its cameras.json)")
@@ -221,6 +219,7 @@ def _add_simplify_arguments(simplify: argparse.ArgumentParser) -> None:
                         help="the fewest of a few numbers that lose at most X dB of PSNR on the training images")
     groups = add_arguments(simplify, skip=[option.name for option in dataclasses.fields(TrainConfig)
                                            if option.name not in SIMPLIFY_OPTIONS], defaults=False)
+    _add_paper(groups["blending"])
     groups["length, and number of Gaussians"].add_argument(
         "--iterations", type=whole_number, metavar="N", default=argparse.SUPPRESS,
         help=f"steps of training (default: {choices.SIMPLIFY_ITERATIONS})")
@@ -246,11 +245,13 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
     parser.add_argument("--scene", help="folder " + scene)
     parser.add_argument("--blend-mode", choices=BLEND_MODES,
-                        help="of a .ply that does not record it (default: alpha); must agree where it does")
+                        help="of a file that does not record it (default: alpha); must agree where it does")
     parser.add_argument("--background-gate", type=number, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
+    parser.add_argument("--faint-below", type=number, metavar="X", help="likewise (default: 0.25 in smoe)")
+    _add_paper(parser)
     parser.add_argument("--white-background", action="store_true", default=None,
-                        help="white background (default: the run's, for a .ply black)")
+                        help="white background (default: the run's, else black)")
 
 
 def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:

@@ -12,10 +12,9 @@ from .arguments import build_parser, completion_script
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .options.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from .options.config_arguments import config_from_arguments, given_options, take_paper
-from .options.early import check_early
+from .options.early import check_cameras, check_early
 from .options.presets import STRATEGY
 from .patches import PatchError
-from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
 from .system.process import command
 
@@ -47,6 +46,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     if unknown:  # argparse would show the usage of `dsmoe` alone
         _refuse(unknown, getattr(arguments, "command_parser", parser))
     try:
+        take_paper(arguments)
         check_early(arguments)
         status = COMMANDS[arguments.command](arguments) or 0
         sys.stdout.flush()
@@ -148,7 +148,6 @@ def _run(arguments: argparse.Namespace) -> None:
     from .patches.run import run
 
     words = arguments.words[1:] if arguments.words[:1] == ["--"] else arguments.words
-    take_paper(arguments)
     if not arguments.blend_mode:
         arguments.command_parser.error("--blend-mode MODE or --paper is needed")
     run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate, arguments.faint_below)
@@ -261,7 +260,6 @@ def _simplify(arguments: argparse.Namespace) -> None:
 
 def _train_config(arguments: argparse.Namespace) -> Tuple[TrainConfig, Optional[Layout]]:
     """The options of a training: those that are given, and for --resume the run's own; the scene's layout if read."""
-    take_paper(arguments)
     given = given_options(arguments)
     if arguments.resume and set(given) & {"scene", "output"} == {"scene"}:  # dsmoe train --resume OUT
         given["output"] = arguments.output = given.pop("scene")
@@ -346,7 +344,7 @@ def _with_lpips(net: str, device: str) -> Measure:
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .inspection import render_images
+    from .inspection import config_of_model, render_images
 
     _choose_device(arguments)
     overrides = _overrides(arguments)
@@ -354,13 +352,14 @@ def _render(arguments: argparse.Namespace) -> None:
     if arguments.orbit:
         _render_orbit(arguments, overrides, outputs)
         return
-    if is_folder(arguments.source):
-        config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
+    if holds_run(arguments.model):
+        config, ply = TrainConfig.of_run(arguments.model, "--scene", **overrides), None
     else:
-        config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
+        config, ply = config_of_model(arguments.model, **overrides)
+        check_cameras(arguments.model, config.scene)
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
                           background_gate=arguments.background_gate, outputs=outputs,
-                          overwrite=arguments.overwrite)
+                          overwrite=arguments.overwrite, faint_below=arguments.faint_below)
     print(f"{len(paths)} images in {arguments.output}")
 
 
@@ -368,8 +367,8 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
     from .filming import film
     from .inspection import open_trained
 
-    trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
-                           **overrides)
+    trained = open_trained(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
+                           arguments.faint_below, **overrides)
     print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
 
 
@@ -385,10 +384,11 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.bake:
         _choose_device(arguments)
     with PromptInterrupt():
-        path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
+        path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
                                arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
                                bake=arguments.bake, bake_iterations=arguments.bake_iterations,
-                               device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
+                               device=arguments.device if arguments.bake else "cpu", faint_below=arguments.faint_below,
+                               **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)
@@ -399,8 +399,8 @@ def _view(arguments: argparse.Namespace) -> None:
     from .view.server import Viewer
 
     _choose_device(arguments)
-    viewer = Viewer(Followed(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
-                             **_overrides(arguments)), arguments.host, arguments.port)
+    viewer = Viewer(Followed(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
+                             arguments.faint_below, **_overrides(arguments)), arguments.host, arguments.port)
     print(f"{viewer.address}/?darkMode: open it in a browser; Ctrl-C ends", flush=True)
     viewer.wait()
 

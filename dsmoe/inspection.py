@@ -12,11 +12,17 @@ from PIL import Image
 
 from .errors import TrainerError, printable
 from .model import GaussianModel
-from .options.config import CHECKPOINT_NAME, LEARNED, TrainConfig
-from .options.early import check_source
+from .options.config import CHECKPOINT_NAME, LEARNED, TrainConfig, holds_run
 from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
-from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, model_path
+from .results.modelfile import (
+    Recorded,
+    agreed_background_gate,
+    agreed_blend_mode,
+    agreed_faint_below,
+    load_model,
+    model_path,
+)
 from .results.pictures import file_names
 from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
@@ -24,6 +30,7 @@ from .results.video import check_folder
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
+from .starting import find_model
 from .system.device import check_device
 from .system.files import is_file, is_folder, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
@@ -82,28 +89,30 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
 
 
 def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str], device: str,
-                  rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
-    """A renderer for a .ply with the blend mode and the background gate that it records.
+                  rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None,
+                  asked_faint: Optional[float] = None) -> Renderer:
+    """A renderer for a file of a model with the blend that it records.
 
     config gives background and antialiasing. Raises TrainerError if what is asked disagrees with the file.
     """
     model, recorded = load_model(ply, device)
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
     gate = agreed_background_gate(ply, mode, recorded, asked_gate)
+    faint = agreed_faint_below(ply, mode, recorded, asked_faint)
     return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
-                    background_gate=gate, faint_below=recorded.faint_below)
+                    background_gate=gate, faint_below=faint)
 
 
 class OpenedRun(NamedTuple):
     """The model of a run."""
 
     renderer: Renderer
-    path: str  # its .ply, or the checkpoint
+    path: str  # of its Gaussians, or the checkpoint
     so_far: Optional[SoFar]  # what the checkpoint holds, if the training has not ended
 
 
 def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
-             rasterize: Optional[Rasterize] = None) -> OpenedRun:
+             rasterize: Optional[Rasterize] = None, asked_faint: Optional[float] = None) -> OpenedRun:
     """A renderer for the model of the run that config is of; before its end, of its checkpoint, which a line says.
 
     Raises TrainerError if there is neither, and if what is asked disagrees with the run.
@@ -112,6 +121,7 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     if config.background_gate != LEARNED:
         recorded = Recorded(mode, float(config.background_gate))
         asked_gate = agreed_background_gate(config.output, mode, recorded, asked_gate)
+    faint = agreed_faint_below(config.output, mode, Recorded(mode, None, config.unusual_faint), asked_faint)
     ply = model_path(config.output, config.iterations)
     if is_file(ply):
         return OpenedRun(open_renderer(config, ply, mode, device, rasterize, asked_gate), ply, None)
@@ -123,7 +133,7 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
           f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
     renderer = Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
-                        rasterize, background_gate=gate, faint_below=config.unusual_faint)
+                        rasterize, background_gate=gate, faint_below=faint)
     return OpenedRun(renderer, so_far.path, so_far)
 
 
@@ -147,7 +157,8 @@ def compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
                   blend_mode: Optional[str] = None, device: str = "cpu",
                   rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
-                  outputs: Sequence[str] = (), overwrite: bool = False) -> List[str]:
+                  outputs: Sequence[str] = (), overwrite: bool = False,
+                  faint_below: Optional[float] = None) -> List[str]:
     """Writes a PNG per camera of config.scene into `folder`; returns the paths.
 
     folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed; with
@@ -155,16 +166,16 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     outputs: "depth" and "alpha" are written beside each. NAME.depth.npy [H, W] float32 is the expected view depth in
     the scene's units, 0 if nothing is hit. NAME.alpha.png has 8 bits, white where Gaussians cover.
 
-    ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: what `open_run`
-    opens of the run that config is of, whose record these two must not contradict. Raises TrainerError.
+    ply: a file that records how it is blended, else `blend_mode`, `background_gate` and `faint_below` say it; None:
+    what `open_run` opens of the run that config is of, whose record these must not contradict. Raises TrainerError.
     """
     check_device(device)
     check_folder(folder, orbit=False)
     own_record(folder, RENDER, overwrite)  # refused before anything is read
     if ply is None:
-        renderer, ply, _ = open_run(config, blend_mode, background_gate, device, rasterize)
+        renderer, ply, _ = open_run(config, blend_mode, background_gate, device, rasterize, faint_below)
     else:
-        renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
+        renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate, faint_below)
     cameras = load_cameras(config, split)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views; --split names others")
@@ -205,8 +216,9 @@ def said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
     """What images show, for their folder's record: other words, and they are not kept beside each other."""
     model = os.stat(ply)
     return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on "
-            f"{os.path.abspath(config.scene)}: {renderer.blend_mode} {renderer.background_gate}, resolution "
-            f"{config.resolution}, principal point {config.principal_point}, lenses {config.lenses}, "
+            f"{os.path.abspath(config.scene)}: {renderer.blend_mode} {renderer.background_gate} "
+            f"{renderer.faint_below}, resolution {config.resolution}, principal point {config.principal_point}, "
+            f"lenses {config.lenses}, "
             f"{'white' if config.white_background else 'black'} background")
 
 
@@ -220,8 +232,8 @@ def to_image(color: torch.Tensor) -> Image.Image:
 class Trained:
     """An opened model."""
 
-    config: TrainConfig  # the run's; of a .ply only background, resolution and scene mean something
-    path: str  # the .ply; of a training that has not ended, the checkpoint
+    config: TrainConfig  # the run's; of another model only what says how its scene is loaded means something
+    path: str  # the file; of a training that has not ended, the checkpoint
     renderer: Renderer
     cameras: List[Camera]  # the scene's test views, else its training views, upright; one on the orbit without a scene
     orbit: Orbit
@@ -229,23 +241,34 @@ class Trained:
 
 
 def open_trained(source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
-                 device: str = "cpu", **options: Any) -> Trained:
-    """Opens the output folder of `dsmoe train`, before its end the checkpoint in it, or a .ply.
+                 device: str = "cpu", faint_below: Optional[float] = None, **options: Any) -> Trained:
+    """Opens a model as `find_model` finds it; of a training that has not ended, its checkpoint.
 
-    blend_mode, background_gate: of a .ply that does not record them (else alpha); they must agree if something does.
+    blend_mode, background_gate, faint_below: of a file that does not record them (else alpha); they must agree if
+    something does.
     options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. There are none if the
     run's scene is not there. Raises TrainerError.
     """
     check_device(device)
-    check_source(source)
-    if is_folder(source):
+    so_far = None
+    if holds_run(source):
         config = TrainConfig.load(source).changed(**options)
-        renderer, path, so_far = open_run(config, blend_mode, background_gate, device)
+        renderer, path, so_far = open_run(config, blend_mode, background_gate, device, None, faint_below)
     else:
-        config, path, so_far = TrainConfig(blend_mode="alpha", **options).validate(), source, None
-        renderer = open_renderer(config, path, blend_mode, device, asked_gate=background_gate)
+        config, path = config_of_model(source, **options)
+        renderer = open_renderer(config, path, blend_mode, device, None, background_gate, faint_below)
     cameras, orbit = places(config, renderer.model, needed="scene" in options)
     return Trained(config, path, renderer, cameras, orbit, so_far is None)
+
+
+def config_of_model(source: str, **options: Any) -> Tuple[TrainConfig, str]:
+    """Of a model that is no run: what its folder knows of its scene, with some options set, and its file.
+
+    Raises TrainerError.
+    """
+    found = find_model(source)
+    known = found.options_on(options.get("scene", ""))
+    return TrainConfig(**{"blend_mode": "alpha", **known, **options}).validate(), found.path
 
 
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:

@@ -177,7 +177,7 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
             fov: Optional[float], progress: bool, say: Callable[[str], None]) -> Any:
     """The largest model that COLMAP makes of the photographs, which it also writes to WORK/best. Raises SceneError."""
     database, count = os.path.join(work, DATABASE), len(names)
-    cameras = _by_camera(photos, names, fov)
+    cameras = _by_camera(photos, names, fov, say)
     guesses = [_camera_guess(pycolmap, os.path.join(photos, first), camera_model, fov) for first, *_ in cameras]
     if _forget_others(photos, names, work, f"{camera_model} {fov}"):
         say("photographs or camera model have changed since the last time: all features are found anew")
@@ -295,10 +295,10 @@ def _checksum(path: str) -> str:
     return hashed.hexdigest()
 
 
-def _by_camera(photos: str, names: Sequence[str], fov: Optional[float]) -> List[List[str]]:
+def _by_camera(photos: str, names: Sequence[str], fov: Optional[float], say: Callable[[str], None]) -> List[List[str]]:
     """The names by camera: those of one size, and of one focal length if they record it.
 
-    Raises SceneError if they record several while `fov` is given.
+    say: is called if they record several while `fov`, from which all cameras start then, is given.
     """
     cameras: Dict[Tuple[Tuple[int, int], Optional[float]], List[str]] = {}
     for name in names:
@@ -306,8 +306,9 @@ def _by_camera(photos: str, names: Sequence[str], fov: Optional[float]) -> List[
         cameras.setdefault((image_size(path), _recorded_focal_length(path)), []).append(name)
     focals = [f"{focal:g} mm" if focal else "none" for focal in {focal: 0 for _, focal in cameras}]
     if fov is not None and len(focals) > 1:
-        raise SceneError(f"--fov is {fov:g}, which is of one focal length; the photographs in {photos} record several "
-                         f"({', '.join(focals[:3])}{', ...' * bool(focals[3:])}); leave it out")
+        some = ", ".join(focals[:3]) + ", ..." * bool(focals[3:])
+        say(f"note: the photographs record several focal lengths ({some}), and each camera starts from --fov {fov:g}; "
+            "without --fov it starts from what they record")
     return [*cameras.values()]
 
 

@@ -144,7 +144,7 @@ def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], No
             say(f"note: the scene that its folder names, {found.missing}, is not there; the model's renderings take "
                 "the place of photographs, unless --scene names these")
         say(f"{start.path}: {start.count:,} Gaussians of SH degree {start.gaussians.sh_degree}, blend mode "
-            f"{start.blend_mode}, {os.path.getsize(start.path) / 1e6:.1f} MB")
+            f"{start.blend_text}, {os.path.getsize(start.path) / 1e6:.1f} MB")
         say(describe_scene(scene, layout, config))
     quality = check_start(scene, config)
     if finds_center and quality.is_centred:

@@ -16,23 +16,20 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES, trained_faint_below
 
 from .errors import ConfigError, TrainerError
-from .export.glb import glb_gaussians
-from .export.splat import splat_gaussians
-from .export.spz import spz_gaussians
 from .model import GaussianModel, finite_rows
-from .options.config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of
+from .options.config import CONFIG_NAME, LEARNED, TrainConfig, holds_run, learned_gate_of, runs_below
 from .options.early import check_model
 from .results.evaluation import evaluate
 from .results.modelfile import (
     agreed_background_gate,
     agreed_blend_mode,
     model_path,
-    raw_of,
-    read_ply,
+    read_gaussians,
     recorded_of,
 )
 from .results.pictures import evenly_spaced
 from .results.rendering import Renderer, background_color
+from .results.shown import raw_of
 from .scenes.images import View
 from .scenes.modelfolder import CAMERAS, CFG_ARGS, latest_model
 from .scenes.pointcloud import SH_C0, PointCloud
@@ -45,7 +42,6 @@ LEAST_PSNR = 15.0  # of a model on its scene, dB: with less they do not belong t
 CHECKED_VIEWS = 16
 LEAST_ABOVE_BOUND = 1e-3  # a learned gate begins above its bound
 CLEARLY = 0.1  # dB of difference that show where a model's program had the principal points
-READERS = {".splat": splat_gaussians, ".spz": spz_gaussians, ".glb": glb_gaussians}
 
 
 @dataclass(frozen=True)
@@ -61,6 +57,13 @@ class Start:
     @property
     def count(self) -> int:
         return len(self.gaussians.means3D)
+
+    @property
+    def blend_text(self) -> str:
+        """Its blend mode, and how to declare one that the file does not record."""
+        hint = "" if self.gaussians.blend_mode else (
+            f" (not recorded; `dsmoe export {self.path} --blend-mode MODE -o declared.ply` records another)")
+        return self.blend_mode + hint
 
     def points(self) -> PointCloud:
         """Places and base colours of the Gaussians."""
@@ -123,21 +126,7 @@ def read_start(path: str) -> Start:
 @functools.lru_cache(maxsize=1)  # options, scene and training ask for it in turn, and a scene keeps it anyway
 def _read_start(path: str, *_: int) -> Start:
     """`read_start` of a file as it was changed last."""
-    ending = os.path.splitext(path)[1].lower()
-    try:
-        if ending in READERS:
-            with open(path, "rb") as file:
-                gaussians = READERS[ending](file.read())
-        else:
-            gaussians = read_ply(path)
-    except OSError as error:
-        raise TrainerError(f"{path}: {error.strerror or error}") from error
-    except TrainerError as error:
-        if "this is no PLY file" not in str(error) or ending == ".ply":
-            raise
-        raise TrainerError(f"{path}: it is none of .ply, .splat, .spz and .glb") from error
-    except ValueError as error:
-        raise TrainerError(f"{path}: {error}") from error
+    gaussians = read_gaussians(path)
     count = len(gaussians.means3D)
     bad = count - int(finite_rows(raw_of(gaussians)).sum())
     if bad or not count:
@@ -158,7 +147,7 @@ def find_model(source: str) -> Found:
     path = latest_model(source)
     if not path:
         raise TrainerError(f"{source}: no model is in it: neither {CONFIG_NAME} of `dsmoe train` nor point_cloud/"
-                           "iteration_N/point_cloud.ply of 3DGS")
+                           "iteration_N/point_cloud.ply of 3DGS" + runs_below(source))
     options = _options_of_3dgs(source)
     missing = "" if is_folder(options.get("scene", "")) else options.pop("scene", "")
     return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {}, missing)
@@ -269,6 +258,6 @@ def _why_not_shown(scene: Scene, config: TrainConfig) -> str:
     elif scene.note:
         questions.append("was it trained on images as they are (--lenses native)")
     if scene.start.gaussians.blend_mode is None:
-        questions.append("is it of another blend than alpha, which the file does not record")
+        questions.append(f"is its blend mode not {scene.start.blend_text}")
     text = ", ".join(questions[:-1]) + ", or " + questions[-1]
     return text[0].upper() + text[1:] + "?"

@@ -47,6 +47,7 @@ def _begin_gate(frozen: bool) -> None:
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate, the mode's."""
     keep_records()
+    _explain_no_gpu()
     _check_renderer()  # if only it was restored, the option would be recorded and ignored
     return resolve_blend_mode(None), ""
 
@@ -180,6 +181,7 @@ def _say_rasterizer(flavour: str) -> None:
     gate = f", background gate {settings.resolve_background_gate(mode, None)}" if mode in GATED_MODES else ""
     say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
     _warn_of_no_kernels()
+    _explain_no_gpu()
 
     def look(*_: Any) -> None:
         used = os.environ.get(USED_VARIABLE, "")  # until the first rendering of this process
@@ -273,6 +275,23 @@ def _warn_of_no_kernels() -> None:
     from dsmoe.system.device import why_no_gpu
     if importlib.import_module("torch").cuda.is_available() and why_no_gpu():
         _warn(f"the GPU cannot be used: {why_no_gpu()}")
+
+
+@functools.lru_cache(maxsize=None)
+def _explain_no_gpu() -> None:
+    """Where the trainer ends in torch's error because there is no GPU, a line behind that says so.
+
+    Not before: asking for GPUs fixes which there are, and some trainers choose theirs later, by an option.
+    """
+    show = sys.excepthook
+
+    def explain(kind: Any, error: BaseException, trace: Any) -> None:
+        show(kind, error, trace)
+        of_torch = isinstance(error, (RuntimeError, AssertionError)) and re.search("(?i)cuda|nvidia", str(error))
+        if of_torch and not importlib.import_module("torch").cuda.is_available():
+            say("no CUDA device is there, and this trainer's own code asks for one; `dsmoe train` needs none")
+
+    sys.excepthook = explain
 
 
 def is_installed(module: str) -> bool:

@@ -89,8 +89,7 @@ std::vector<std::string> blend_names() {
 
 BlendRules<double> choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
                                 std::optional<double> background_gate) {
-  const bool is_splat = file_extension(file) == ".splat";  // which viewers blend by alpha
-  std::string record = is_splat ? "alpha" : model.blend_mode;
+  std::string record = model.blend_mode;
   if (mode.empty() && record.empty()) {
     std::fprintf(stderr,
                  "note: %s records no blend, so it is alpha, as other 3DGS programs blend; --blend says otherwise\n",
@@ -105,9 +104,8 @@ BlendRules<double> choose_blend(const io::GaussianModel& model, const std::strin
   BlendRules<double> choice;
   choice.mode = *chosen;
   if (!record.empty() && chosen != recorded) {
-    std::fprintf(stderr, "note: %s %s the blend %s; in another one Gaussians show another scene\n", file.c_str(),
-                 is_splat ? "does not say its blend; viewers take it for" : "was trained with",
-                 io::printable(record).c_str());
+    std::fprintf(stderr, "note: %s was trained with the blend %s; in another one Gaussians show another scene\n",
+                 file.c_str(), io::printable(record).c_str());
   }
   if (choice.mode != BlendMode::kSmoe && choice.mode != BlendMode::kSmoeEq7) {
     if (background_gate) throw UsageError("--background-gate is for --blend smoe and smoe_eq7 only");

@@ -5,7 +5,7 @@ import math
 import sys
 from typing import Any, Dict, NamedTuple, Optional
 
-from diff_smoe_rasterization.settings import resolve_background_gate
+from diff_smoe_rasterization.settings import resolve_background_gate, trained_faint_below
 
 from ..errors import TrainerError
 from ..inspection import compared
@@ -91,7 +91,10 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
         raise TrainerError("the model is blended by alpha already; leave out --bake")
     if iterations < 1:
         raise TrainerError(f"--bake-iterations is {iterations}; it must be at least 1")
-    blend = {"blend_mode": mode, "background_gate": gate} if _takes_gate(mode) else {"blend_mode": "alpha"}
+    blend: Dict[str, Any] = {"blend_mode": "alpha"}
+    if _takes_gate(mode):
+        blend = {"blend_mode": mode, "background_gate": gate,
+                 "faint_below": trained_faint_below(mode, renderer.faint_below)}
     squares = config.importance_options().squares if config.strategy == "importance" else 0.0
     config = config.changed(
         **blend, strategy="steady", densify_until_iter=0, budget=0, batch=1, iterations=iterations,

@@ -13,14 +13,15 @@ from ..errors import TrainerError, printable
 from ..inspection import Trained, open_trained
 from ..options.choices import BAKE_ITERATIONS
 from ..options.choices import EXPORT_FORMATS as FORMATS
-from ..results.modelfile import save_model
+from ..results.glb import BLEND, Blend, glb_bytes
+from ..results.modelfile import read_gaussians, save_model
 from ..results.pictures import evenly_spaced
 from ..results.rows import blend_name, viewer_warning
+from ..results.shown import FAINT_BELOW
+from ..results.splat import splat_bytes
+from ..results.spz import check_spz, spz_bytes
 from ..system.files import check_output, is_folder, new_file, write_atomically
 from . import html
-from .glb import BLEND, Blend, glb_bytes
-from .splat import splat_bytes
-from .spz import check_spz, spz_bytes
 
 VIEWS = 16  # of a page, at most
 
@@ -29,7 +30,7 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
            blend_mode: Optional[str] = None, background_gate: Optional[float] = None, *, overwrite: bool = False,
            bake: Optional[str] = None, bake_iterations: int = BAKE_ITERATIONS, device: str = "cpu",
            **options: Any) -> Tuple[str, str]:
-    """Writes the model of a run's folder or of a .ply; returns the file's path and a note, which may be empty.
+    """Writes a model as one file; returns the file's path and a note, which may be empty.
 
     form: one of FORMATS; None: by the ending of `path`, else html. path: None: model.FORM. sh_degree: the highest
     degree of view-dependent colour that is kept. overwrite: `path` may be a file that is there. bake: "alpha"
@@ -77,7 +78,7 @@ def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str
                  run=config if config.output else None)
     ply = os.path.join(folder, "baked.ply")
     save_model(ply, baked.renderer.model, baked.renderer.blend_mode, 1.0)
-    name = blend_name(before.blend_mode, float(before.background_gate))
+    name = blend_name(before.blend_mode, float(before.background_gate), before.faint_below)
     note = "the scene has no test images: what the baking costs was not measured"
     if baked.trained is not None:
         note = (f"test PSNR: {baked.trained:.2f} dB in {name}, {baked.shown:.2f} dB when viewers blend that by alpha, "
@@ -87,7 +88,7 @@ def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str
 
 def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], overwrite: bool) -> str:
     """Writes the file; returns a warning, which may be empty."""
-    gaussians = io.read_gaussians(trained.path)
+    gaussians = read_gaussians(trained.path)
     if sh_degree is not None:
         gaussians = dataclasses.replace(gaussians, shs=gaussians.shs[:, :(sh_degree + 1) ** 2 - 1])
     renderer = trained.renderer
@@ -115,9 +116,12 @@ def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: 
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
     recorded: Dict[str, Any] = {"blend_mode": mode,
                                 "background_gate": float(gate) if mode in GATED_MODES else None}
-    others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # of an older name
+    known = (*recorded, FAINT_BELOW)  # also of an older name
+    others = [line for line in gaussians.comments if line.split(" ")[0] not in known]
+    if trained.renderer.faint_below is not None:
+        others.append(f"{FAINT_BELOW} {trained.renderer.faint_below:g}")
     with new_file(path, overwrite) as temporary:
-        io.write_gaussians(temporary, dataclasses.replace(gaussians, comments=others, **recorded))
+        io.write_gaussians(temporary, dataclasses.replace(gaussians, comments=tuple(others), **recorded))
 
 
 def _shown(trained: Trained) -> html.Shown:

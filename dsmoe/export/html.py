@@ -16,10 +16,10 @@ from diff_smoe_rasterization.io import Gaussians
 from diff_smoe_rasterization.settings import trained_faint_below
 
 from ..errors import TrainerError
+from ..results.shown import finite_rows, sigmoid
 from ..scenes.cameras import Camera
 from ..scenes.orbit import Orbit
 from ..system.process import command
-from .rows import finite_rows, sigmoid
 
 PAGE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "page")
 MODES = ("alpha", "smoe", "smoe_eq7")

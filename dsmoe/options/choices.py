@@ -17,6 +17,7 @@ MOST_EXHAUSTIVE = 200  # photographs, up to which `auto` compares all pairs
 ORBIT_FRAMES = 120
 VIDEO_FPS = 30.0
 
+MODEL = "a .ply, .splat, .spz or .glb, an output folder of `dsmoe train`, or a model folder of 3DGS"
 EXPORT_FORMATS = ("html", "ply", "splat", "spz", "glb")  # the first is the default
 BAKE_ITERATIONS = 5000
 

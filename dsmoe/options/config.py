@@ -22,7 +22,7 @@ from diff_smoe_rasterization.settings import (
 
 from ..errors import ConfigError
 from ..system.files import is_file, is_folder, write_text_atomically
-from .choices import DEVICES, LENSES
+from .choices import DEVICES, LENSES, MODEL
 from .importance_options import ImportanceOptions, parse_importance_options
 
 CONFIG_NAME = "config.json"
@@ -110,9 +110,8 @@ class TrainConfig:
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
     init: str = _option(
-        "", "start from the Gaussians of a model, in place of the scene's points: a .ply, .splat, .spz or .glb, an "
-            "output folder of `dsmoe train` or a model folder of 3DGS. --blend-mode is then the model's by default",
-        metavar="MODEL")
+        "", f"start from the Gaussians of a model, in place of the scene's points: {MODEL}. --blend-mode is then the "
+            "model's by default", metavar="MODEL")
     budget: int = _option(
         0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed (default: importance chooses it "
            "for the scene)")
@@ -339,11 +338,8 @@ class TrainConfig:
         if not is_folder(folder):
             raise ConfigError(f"{folder}: no such folder; name the output folder of `dsmoe train`")
         if not holds_run(folder):
-            runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
             raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
-                              + (f"; such are {', '.join(runs[:3])}" if runs else "")
-                              + ("; of another trainer's model name the .ply" if is_file(
-                                  os.path.join(folder, "cfg_args")) else ""))
+                              + runs_below(folder))
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
@@ -433,6 +429,12 @@ def _set_by(names: Sequence[str], chosen: Any) -> Dict[str, Any]:
 def holds_run(folder: str) -> bool:
     """Whether OUT/config.json is there. Raises TrainerError if that cannot be seen."""
     return is_file(os.path.join(folder, CONFIG_NAME))
+
+
+def runs_below(folder: str) -> str:
+    """What an error says of runs in the folder, where one was looked for."""
+    runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
+    return f"; such are {', '.join(runs[:3])}" if runs else ""
 
 
 def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:

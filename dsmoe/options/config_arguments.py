@@ -86,8 +86,8 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
 
 
 def take_paper(arguments: argparse.Namespace) -> None:
-    """Sets the options that --paper stands for. Raises ConfigError if one is given and is another."""
-    for name, value in PAPER_PROGRAM.items() if arguments.paper else ():
+    """Sets the options that --paper stands for, where it is given. Raises ConfigError if one of them is another."""
+    for name, value in PAPER_PROGRAM.items() if getattr(arguments, "paper", False) else ():
         given = getattr(arguments, name, None)
         if given not in (None, value) and str(given) != str(value):
             raise ConfigError(f"--{name.replace('_', '-')} is {given!r}; with --paper it is {value!r}, or left out")

@@ -2,13 +2,14 @@
 from __future__ import annotations
 
 import argparse
-import copy
 import os
+from typing import Optional
 
 from ..errors import SceneError, TrainerError
 from ..system.files import check_output, is_file, is_folder
-from .config import TrainConfig
-from .config_arguments import given_options, take_paper
+from .choices import MODEL
+from .config import TrainConfig, holds_run
+from .config_arguments import given_options
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 FROM_VIDEO = "of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
@@ -28,12 +29,11 @@ def check_early(arguments: argparse.Namespace) -> None:
     elif command == "eval":
         TrainConfig.load(arguments.output)
     elif command in ("render", "export", "view"):
-        is_lone = command == "render" and not arguments.orbit
-        check_source(arguments.source, "and --scene" if is_lone else "")
-        if is_folder(arguments.source):
-            TrainConfig.load(arguments.source)
-        elif is_lone and not scene:
-            raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
+        check_model(arguments.model)
+        if holds_run(arguments.model):
+            TrainConfig.load(arguments.model)
+        elif command == "render" and not arguments.orbit and is_file(arguments.model):
+            check_cameras(arguments.model, scene)
         if command == "render" and arguments.orbit:
             check_orbit(arguments.frames, arguments.fps)
         if command == "export" and arguments.output:
@@ -47,26 +47,22 @@ def _check_options(arguments: argparse.Namespace) -> None:
     if getattr(arguments, "init", ""):
         check_model(arguments.init)
         return  # that model says how it is blended
-    arguments = copy.copy(arguments)
-    take_paper(arguments)
     given = {**given_options(arguments), "device": "cpu", "strategy": "steady", "strategy_options": ""}
     if "iterations" not in given:  # a preset has its own, and --batch divides them
         given.pop("batch", None)
     TrainConfig(**given).validate()
 
 
-def check_source(source: str, besides: str = "") -> None:
-    """Raises TrainerError if there is no such folder or file. besides: what a .ply needs, for that error."""
-    if not is_folder(source) and not is_file(source):
-        raise TrainerError(f"{source}: no such file or folder; name the output folder of `dsmoe train`, or a .ply"
-                           + (f" {besides}" if besides else ""))
+def check_cameras(source: str, scene: Optional[str]) -> None:
+    """Raises TrainerError if a model that is no run has no scene."""
+    if not scene:
+        raise TrainerError(f"{source} holds no cameras; name the folder that has them with --scene")
 
 
 def check_model(source: str) -> None:
-    """Raises TrainerError if there is no such file or folder of a model to start from."""
+    """Raises TrainerError if there is no such file or folder of a model."""
     if not is_file(source) and not is_folder(source):
-        raise TrainerError(f"{source}: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of "
-                           "`dsmoe train` or a model folder of 3DGS")
+        raise TrainerError(f"{source}: no such file or folder; name {MODEL}")
 
 
 def check_scene(folder: str) -> None:

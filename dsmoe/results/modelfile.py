@@ -1,11 +1,9 @@
-"""GaussianModel to and from Inria-format .ply files, whose comments record how Gaussians are blended."""
+"""GaussianModel to and from files. Comments of a .ply record how its Gaussians are blended."""
 from __future__ import annotations
 
 import os
 import sys
-from typing import Dict, NamedTuple, Optional, Tuple
-
-import torch
+from typing import NamedTuple, Optional, Tuple
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import (
@@ -13,13 +11,18 @@ from diff_smoe_rasterization.settings import (
     GATED_MODES,
     resolve_background_gate,
     resolve_faint_below,
+    trained_faint_below,
 )
 
 from ..errors import TrainerError, printable
 from ..model import GaussianModel, finite_rows
 from ..system.files import new_file
+from .glb import glb_gaussians
+from .shown import FAINT_BELOW, raw_of
+from .splat import splat_gaussians
+from .spz import spz_gaussians
 
-FAINT_BELOW = "faint_below"  # in comments
+READERS = {".splat": splat_gaussians, ".spz": spz_gaussians, ".glb": glb_gaussians}
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, as viewers of 3DGS expect it
 
 
@@ -53,11 +56,11 @@ def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate
 
 
 def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
-    """Reads a .ply; returns the model, all its SH degrees active, and what the file says of its blend.
+    """Reads a file; returns the model, all its SH degrees active, and what the file says of its blend.
 
     Raises TrainerError naming file and reason, also if no Gaussian can be shown.
     """
-    stored = read_ply(path)
+    stored = read_gaussians(path)
     raw = raw_of(stored, device)
     if len(stored.means3D) and not finite_rows(raw).any():
         raise TrainerError(f"{path}: each of its {len(stored.means3D):,} Gaussians has a number that is NaN or "
@@ -66,20 +69,26 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     return model, recorded_of(path, stored)
 
 
-def read_ply(path: str) -> io.Gaussians:
-    """Reads a .ply. Raises TrainerError naming file and reason."""
+def read_gaussians(path: str) -> io.Gaussians:
+    """Reads a .ply, .splat, .spz or .glb. Raises TrainerError naming file and reason."""
+    ending = os.path.splitext(path)[1].lower()
     try:
-        return io.read_gaussians(path)
+        if ending not in READERS:
+            return io.read_gaussians(path)
+        with open(path, "rb") as file:
+            return READERS[ending](file.read())
     except OSError as error:
         raise TrainerError(f"{path}: {error.strerror or error}") from error
+    except TrainerError:
+        raise
     except ValueError as error:
-        text = str(error)
+        text = f"{path}: {error}" if ending in READERS else str(error)
+        if "this is no PLY file" in text and ending != ".ply":
+            text = f"{path}: it is none of .ply, .splat, .spz and .glb"
         other = ("; it is compressed, as SuperSplat does: let that write a .ply that is not"
                  if "packed_position" in text else
                  "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
-                 if "no scalar property" in text else
-                 "; `dsmoe simplify` and `dsmoe train --init` read such files, other commands a .ply"
-                 if path.lower().endswith((".splat", ".spz", ".glb")) else "")
+                 if "no scalar property" in text else "")
         raise TrainerError(text + other) from error
 
 
@@ -94,15 +103,8 @@ def recorded_of(path: str, stored: io.Gaussians) -> Recorded:
     return Recorded(stored.blend_mode, stored.background_gate, faint)
 
 
-def raw_of(gaussians: io.Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:
-    """The raw parameters in a file, float32."""
-    arrays = {"means3D": gaussians.means3D, "dc": gaussians.dc, "shs": gaussians.shs,
-              "opacities": gaussians.opacity_logits, "scales": gaussians.log_scales, "rotations": gaussians.rotations}
-    return {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
-
-
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
-    """The blend mode to render a .ply with: the recorded one, else the one asked for, else alpha, which a line says.
+    """The blend mode to render a file with: the recorded one, else the one asked for, else alpha, which a line says.
 
     Raises TrainerError if both disagree, or the recorded one is unknown.
     """
@@ -120,7 +122,7 @@ def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) 
 
 
 def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> float:
-    """The background gate to render a .ply with in this blend mode: by the rules of `agreed_blend_mode`.
+    """The background gate to render a file with in this blend mode: by the rules of `agreed_blend_mode`.
 
     A file that records a mode and no gate was trained with 0. Raises TrainerError.
     """
@@ -138,10 +140,23 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
         raise TrainerError(f"{path} was trained with the background gate {gate!r}, not {asked!r}; "
                            "with another one its Gaussians show another scene")
     if gate is None and asked is None:
-        raise TrainerError(f"{path} does not say which background gate it was trained with (no `comment "
-                           "background_gate`); pass --background-gate, which is 0 for the paper's Eq. 7 and for models "
-                           "of its authors' program")
+        raise TrainerError(f"{path} does not say which background gate it was trained with; pass "
+                           "--background-gate, which is 0 for the paper's Eq. 7, or --paper for a model of its "
+                           "authors' program")
     try:
         return float(resolve_background_gate(blend_mode, asked if gate is None else gate))
+    except ValueError as error:
+        raise TrainerError(str(error)) from error
+
+
+def agreed_faint_below(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> Optional[float]:
+    """The `faint_below` to render a file with, None as usual: by the rules of `agreed_blend_mode`."""
+    known = trained_faint_below(blend_mode, recorded.faint_below)
+    if asked in (None, known):
+        return recorded.faint_below
+    if recorded.blend_mode is not None or recorded.faint_below is not None or blend_mode not in GATED_MODES:
+        raise TrainerError(f"{path}: in the blend mode {blend_mode} its faint_below is {known:g}, not {asked:g}")
+    try:
+        return resolve_faint_below(blend_mode, asked)
     except ValueError as error:
         raise TrainerError(str(error)) from error

@@ -13,8 +13,8 @@ from ..optimizer import GaussianOptimizer
 from ..options.config import LEARNED, TrainConfig
 from ..results.evaluation import PASSES, Evaluation, Measure, evaluate, psnr_alone
 from ..results.metrics import image_metrics, psnr
-from ..results.modelfile import raw_of
 from ..results.rendering import Rasterize, Renderer, background_color
+from ..results.shown import raw_of
 from ..scenes.images import View
 from ..scenes.scene import Scene, difference_of, scene_fingerprint
 from ..system.group import ALONE

@@ -6,18 +6,18 @@ from typing import Any, List, Optional, Tuple
 
 from ..errors import TrainerError
 from ..inspection import Trained, open_trained, places
-from ..options.config import CHECKPOINT_NAME, TrainConfig
+from ..options.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from ..results.modelfile import model_path
 from ..results.rendering import Renderer, background_color
 from ..scenes.cameras import Camera
 from ..scenes.orbit import Orbit
 from ..system.device import check_device
-from ..system.files import is_file, is_folder
+from ..system.files import is_file
 from ..training.checkpoint import made_so_far
 
 
 class Followed:
-    """A model by its run's folder or its .ply; `poll` takes over what a training has written since."""
+    """A model; of a run, `poll` takes over what a training has written since."""
 
     renderer: Renderer
     cameras: List[Camera]
@@ -25,13 +25,13 @@ class Followed:
     progress: str  # of a training, in words
 
     def __init__(self, source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
-                 device: str = "cpu", **options: Any) -> None:
+                 device: str = "cpu", faint_below: Optional[float] = None, **options: Any) -> None:
         """Arguments as in `open_trained`. Raises TrainerError, also if a run has no checkpoint yet."""
-        self._arguments = (source, blend_mode, background_gate, device)
+        self._arguments = (source, blend_mode, background_gate, device, faint_below)
         self._options = options
         self._config: Optional[TrainConfig] = None  # of the run that is shown
         self._seen: Optional[Tuple[str, int]] = None  # the file that is shown, and when it was written
-        self._is_run = is_folder(source)
+        self._is_run = holds_run(source)
         check_device(device)
         if self._is_run:
             self.poll()
@@ -71,7 +71,7 @@ class Followed:
         self.progress = ""
 
     def _take_checkpoint(self, config: TrainConfig) -> None:
-        device = self._arguments[-1]
+        device = self._arguments[3]
         so_far = made_so_far(config, device)
         renderer = Renderer(so_far.model, str(config.blend_mode), background_color(config.white_background, device),
                             config.antialiasing, background_gate=so_far.background_gate,

@@ -14,9 +14,9 @@ from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from diff_smoe_rasterization.reference import sh_basis
 from dsmoe.cli import main
 from dsmoe.errors import TrainerError
-from dsmoe.export.glb import glb_bytes
-from dsmoe.export.rows import y_up
 from dsmoe.inspection import open_trained
+from dsmoe.results.glb import glb_bytes
+from dsmoe.results.shown import y_up
 from dsmoe.starting import read_start
 
 COUNT = 20
@@ -246,7 +246,7 @@ def test_gsply_reads_an_spz_to_the_bits_of_the_format(export, capsys):
 
 @pytest.mark.parametrize("largest, bits", [(0.5, 20), (7.9, 20), (8.0, 19), (1000.0, 13), (8000.0, 10), (1e9, 10)])
 def test_an_spz_has_as_many_bits_behind_the_point_as_there_is_room_for(largest, bits):
-    from dsmoe.export.spz import fractional_bits
+    from dsmoe.results.spz import fractional_bits
 
     assert fractional_bits(np.array([[0, -largest, 0.1]], np.float32)) == bits
 
@@ -272,7 +272,7 @@ def test_an_spz_without_gsply_is_refused_with_the_command_that_helps(export, tmp
 
 
 def test_a_glb_of_more_than_4_GiB_is_refused(monkeypatch):
-    from dsmoe.export import glb
+    from dsmoe.results import glb
 
     monkeypatch.setattr(glb, "LARGEST", 4000)
     with pytest.raises(TrainerError, match="a lower --sh-degree makes it smaller"):

@@ -11,7 +11,7 @@ import pytest
 from diff_smoe_rasterization import io
 from dsmoe.cli import main
 from dsmoe.export import html
-from dsmoe.export.splat import splat_bytes
+from dsmoe.results.splat import splat_bytes
 
 QUARTER = np.sqrt(0.5)  # cos and sin of an eighth turn
 

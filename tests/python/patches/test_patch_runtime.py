@@ -249,3 +249,14 @@ def test_a_script_that_says_no_blend_mode_is_told_how():
     assert runtime.chosen_blend(SimpleNamespace(blend=ALPHA)) == ALPHA
     with pytest.raises(RuntimeError, match="needs the statements `from .* import saved_blend_of` and `pipe.blend"):
         runtime.chosen_blend(SimpleNamespace(debug=False))
+
+
+@pytest.mark.parametrize("ends, explained", [("torch.zeros(1).cuda()", True), ("open('nowhere')", False),
+                                             ("raise KeyboardInterrupt('cuda')", False)])
+def test_a_trainer_that_needs_a_gpu_ends_with_a_line_that_says_so(python, tmp_path, ends, explained):
+    """Behind torch's traceback; other errors are shown as before."""
+    begins = "from dsmoe.patches import runtime\nimport torch\nruntime.default_blend()\nruntime.default_smoe()\n"
+    done = python("-c", begins + ends, cwd=tmp_path, CUDA_VISIBLE_DEVICES="")
+    assert done.status and "Traceback" in done.err
+    assert done.err.count("no CUDA device is there, and this trainer's own code asks for one") == explained
+    assert not explained or done.err.splitlines()[-1].endswith("; `dsmoe train` needs none")

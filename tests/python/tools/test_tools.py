@@ -190,12 +190,14 @@ def test_a_splat_is_drawn_as_its_ply(tmp_path):
     rows["rotation"] = np.clip(np.rint(rotation * 128 + 128), 0, 255)
     (tmp_path / "model.splat").write_bytes(rows.tobytes())
     pictures = []
-    for name in ("model.ply", "model.splat"):
-        tool("dsmoe_render", tmp_path / name, "--cameras", write_cameras(tmp_path, "cameras.json"), "--device", "cpu",
-             "--overwrite", "-o", tmp_path / "out.png")
+    for words, note in (["model.ply"], ""), (["model.splat"], "no blend, so"), (["model.splat", "--blend", "smoe"], ""):
+        said = tool("dsmoe_render", tmp_path / words[0], "--cameras", write_cameras(tmp_path, "cameras.json"),
+                    "--device", "cpu", "--overwrite", "-o", tmp_path / "out.png", *words[1:])
+        assert ("note: " in said) == bool(note) and note in said
         pictures.append(np.asarray(Image.open(tmp_path / "out.png")).astype(int))
     # 8 bits of a quaternion turn a Gaussian by up to half a degree, and 30 Gaussians lie on a pixel.
     assert np.abs(pictures[0] - pictures[1]).mean() < 1 and np.abs(pictures[0] - pictures[1]).max() < 12
+    assert np.abs(pictures[0] - pictures[2]).mean() > 5, "declared to be of smoe"
 
 
 @pytest.mark.parametrize("name", ["view.png", "out.mp4", "out.png"])

@@ -120,6 +120,26 @@ def test_the_loss_is_the_one_with_which_the_run_ended(smoe_run, monkeypatch, opt
     assert float(value) == pytest.approx(float(expected), rel=1e-5)  # float32 sums
 
 
+def test_a_declared_model_begins_as_it_is_blended(smoe_run, tmp_path, monkeypatch, capsys):
+    """A .splat records nothing; $DSMOE_FAINT_BELOW is for trainings."""
+    splat, begun, step = str(tmp_path / "model.splat"), [], Trainer.step
+
+    def seen(self, *arguments):
+        begun.append(self.renderer.settings_of(self.scene.train[0].camera))
+        return step(self, *arguments)
+
+    monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.5")
+    monkeypatch.setattr(Trainer, "step", seen)
+    assert main(["export", smoe_run.output, "-o", splat]) == 0
+    for words, faint, name in ((["--paper"], 2, "smoe (gate 0, all pairs)"), (
+            ["--blend-mode", "smoe", "--background-gate", "0.01"], 0.25, "smoe (gate 0.01)")):
+        assert main(["export", splat, "--bake", "alpha", "--bake-iterations", "5", "--scene", smoe_run.scene, *words,
+                     "--overwrite", "-o", str(tmp_path / "baked.ply"), "--device", "cpu"]) == 0
+        assert (begun[0].blend_mode, begun[0].faint_below) == ("smoe", faint)
+        assert f"dB in {name}, " in capsys.readouterr().out
+        begun.clear()
+
+
 def test_a_mode_without_a_gate_is_baked_in_alpha_alone(smoe_run, tiny_scene, tmp_path, capsys):
     """A .ply with --scene; the ablation has another weight of each Gaussian, and no gate that could rise."""
     ablation, path = str(tmp_path / "ablation.ply"), str(tmp_path / "baked.ply")

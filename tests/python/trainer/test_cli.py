@@ -201,7 +201,7 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         "simplify|nowhere|-o|o|--budget|9": "nowhere: no such file or folder; name a .ply, .splat",
         "scene|nowhere|-o|o": "no such folder of photographs", "eval|nowhere": "nowhere: no such folder",
         f"eval|{tmp_path}": "holds no config.json", "render|nowhere|-o|o": "no such file or folder",
-        f"render|{ply}|-o|o": "a .ply holds no cameras", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
+        f"render|{ply}|-o|o": f"{ply} holds no cameras", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
         f"render|{ply}|-o|o|--scene|nowhere": "scene nowhere: no such folder", "view|nowhere": "no such file or folder",
         "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it"}
     listed = {"": "measure a trained run again", "patch": "take the patch out of every file",
@@ -548,6 +548,8 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
         place = [] if source == trained else ["--scene", scene]
         text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--background-gate", "0.5")
         assert f"gate {GATE}, not 0.5" in text
+        text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--faint-below", "0.5")
+        assert "in the blend mode smoe_eq7 its faint_below is 2, not 0.5" in text
     text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe_eq7")
     assert "bare.ply" in text and "--background-gate" in text
     assert "gate 0.0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
@@ -581,9 +583,12 @@ def test_a_model_of_the_papers_authors_is_rendered_by_smoe_with_the_gate_0(train
         return np.asarray(Image.open(os.path.join(folder, "view_000.png")))
 
     assert not np.array_equal(rendered("smoe"), rendered("smoe_eq7")), "the two rules show different images"
+    assert main(["render", str(ply), "--scene", scene, "--paper", "-o", str(tmp_path / "program")]) == 0
+    program = np.asarray(Image.open(tmp_path / "program" / "view_000.png"))
+    assert not np.array_equal(program, rendered("smoe")), "all pairs count in it"
     nowhere = ["-o", str(tmp_path / "no")]
     assert "authors' program" in fails(capsys, "render", str(ply), "--scene", scene, "--blend-mode", "smoe", *nowhere)
-    assert "name the .ply" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)
+    assert "out-temp holds no cameras; name" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)
 
 
 @pytest.mark.parametrize("mode, gate, warns", [
@@ -694,10 +699,9 @@ def test_errors_come_before_anything_is_written(scene, tmp_path, capsys):
     io.write_points(cloud, io.Points(np.zeros((3, 3))))
     assert "a video is written with --orbit" in fails(capsys, "render", cloud, "-o", output + ".mp4", "--scene", scene)
     assert re.search(r"points\.ply.*not a model of Gaussians", fails(capsys, "export", cloud))
-    assert "--scene" in fails(capsys, "render", "model.ply", "-o", output)
     for words in (["view", "model.ply"], ["export", "model.ply"], ["render", "model.ply", "-o", output, "--orbit"]):
         said = fails(capsys, *words)
-        assert "model.ply: no such file or folder; name the output folder of `dsmoe train`, or a .ply" in said
+        assert "model.ply: no such file or folder; name a .ply, .splat, .spz or .glb, an output folder of" in said
     assert "model.ply" in fails(capsys, "render", "model.ply", "-o", output, "--scene", scene)
 
 

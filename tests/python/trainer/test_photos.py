@@ -233,10 +233,13 @@ def test_photographs_are_of_one_camera_if_size_and_focal_length_say_so(tmp_path)
                               ("d.jpg", (6, 8), 24.0), ("e.jpg", (6, 8), None)):
         save_photograph(tmp_path / name, size, focal)
     names = ["a.jpg", "c.jpg", "d.jpg", "b.jpg", "e.jpg"]
-    assert photos._by_camera(str(tmp_path), names, None) == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"], ["e.jpg"]]
-    assert photos._by_camera(str(tmp_path), ["a.jpg", "d.jpg"], 90.0) == [["a.jpg"], ["d.jpg"]]
-    with pytest.raises(SceneError, match="--fov is 90, which is of one focal length; .* several .24 mm, 50 mm, none"):
-        photos._by_camera(str(tmp_path), names, 90.0)
+    said = []
+    assert photos._by_camera(str(tmp_path), ["a.jpg", "d.jpg"], 90.0, said.append) == [["a.jpg"], ["d.jpg"]]
+    four = [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"], ["e.jpg"]]
+    assert photos._by_camera(str(tmp_path), names, None, said.append) == four and not said
+    assert photos._by_camera(str(tmp_path), names, 90.0, said.append) == four
+    note, = said
+    assert "several focal lengths (24 mm, 50 mm, none), and each camera starts from --fov 90; without" in note
 
 
 class FakeModel:

@@ -19,13 +19,14 @@ from dsmoe import simplify as module
 from dsmoe.cli import main
 from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import ConfigError, TrainerError
-from dsmoe.export.glb import glb_bytes
 from dsmoe.inspection import open_renderer
 from dsmoe.model import GaussianModel
 from dsmoe.options.config import TrainConfig
 from dsmoe.results.evaluation import evaluate
+from dsmoe.results.glb import glb_bytes
 from dsmoe.results.metrics import quantised
-from dsmoe.results.modelfile import load_model, model_path, raw_of
+from dsmoe.results.modelfile import load_model, model_path
+from dsmoe.results.shown import raw_of
 from dsmoe.scenes.colmap import read_colmap_layout
 from dsmoe.scenes.lens import Lens
 from dsmoe.scenes.scene import load_scene, read_layout
@@ -172,6 +173,27 @@ def test_alpha_becomes_smoe_and_a_smoe_model_keeps_its_gate(run, tmp_path, capsy
     assert main(["simplify", ply, "--scene", run.scene, "--budget", "30", "-o", str(tmp_path / "no"), "--blend-mode",
                  "alpha"]) == 1
     assert "dsmoe export OUT --bake alpha" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("recorded", ["alpha", None])
+def test_a_model_becomes_one_of_the_authors_program(run, tmp_path, capsys, recorded):
+    """--paper is of what is made: smoe, gate 0, all pairs. What it is made of is alpha, and the command says why."""
+    ply, output = str(tmp_path / "model.ply"), str(tmp_path / "paper")
+    io.write_gaussians(ply, dataclasses.replace(io.read_gaussians(ply_of(run)), blend_mode=recorded, comments=()))
+    words = ["--iterations", "4", "--resolution", "30", "--quiet", "--device", "cpu"]
+    simplifies = ["simplify", ply, "--scene", run.scene, "--budget", "40", *words]
+    assert main([*simplifies, "-o", output, "--paper"]) == 0
+    said = capsys.readouterr().out
+    row, = results_of(output)
+    assert (row["blend_mode"], row["background_gate"], row["protocol"]["faint_below"]) == ("smoe", 0, 2)
+    assert row["start"]["blend_mode"] == "alpha" and load_model(model_path(output, 4), "cpu")[1] == ("smoe", 0, 2)
+    assert main(["train", run.scene, "--init", ply, "-o", str(tmp_path / "trained"), *words]) == 0
+    for text in (said, capsys.readouterr().out):
+        assert "blend mode alpha" in text
+        assert (f"(not recorded; `dsmoe export {ply} --blend-mode MODE -o declared" in text) == (recorded is None)
+    for other in (["--blend-mode", "alpha"], ["--background-gate", "1"], ["--faint-below", "0.25"]):
+        assert main([*simplifies, "-o", str(tmp_path / "no"), "--paper", *other]) == 1
+        assert f"{other[0]} is " in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
 def test_without_photographs_a_model_is_its_own_teacher(run, tmp_path, capsys):
@@ -426,16 +448,14 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
     assert "was its background black (now it is white)?" in fails(ply, *scene, "--white-background")
     io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]], blend_mode=None,
                                                 comments=()))
-    assert fails(ply, *scene).endswith(", or is it of another blend than alpha, which the file does not record?\n")
+    assert fails(ply, *scene).endswith("or is its blend mode not alpha (not recorded; `dsmoe export "
+                                       f"{ply} --blend-mode MODE -o declared.ply` records another)?\n")
     (tmp_path / "model.ksplat").write_bytes(bytes(64))
     assert "model.ksplat: it is none of .ply, .splat, .spz and .glb" in fails(str(tmp_path / "model.ksplat"), *scene)
     packed = "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex 1\n{packed}end_header\n"
     (tmp_path / "packed.ply").write_bytes(header.encode() + bytes(16))
     assert "it is compressed, as SuperSplat does" in fails(str(tmp_path / "packed.ply"), *scene)
-    (tmp_path / "m.glb").write_bytes(b"glTF")
-    assert main(["export", str(tmp_path / "m.glb"), "-o", output + ".ply"]) == 1
-    assert "other commands a .ply" in capsys.readouterr().err
     main(["simplify", ply, "--budget", "40", "-o", output])
     assert "neither photographs nor cameras are known; name its scene with --scene" in capsys.readouterr().err
     (tmp_path / "bare").mkdir()

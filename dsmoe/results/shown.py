@@ -2,20 +2,28 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import List
+from typing import Dict, List
 
 import numpy as np
+import torch
 
 from diff_smoe_rasterization.io import Gaussians
 
 from ..model import finite_rows as are_finite
-from ..results.modelfile import raw_of
 
 # What half a turn about x makes of x, y, z, and of the real spherical harmonics of degrees 1 to 3 (y, z, x; xy, ...).
 TURNED_AXES = np.array([1, -1, -1], np.float32)
 TURNED_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
+FAINT_BELOW = "faint_below"  # in comments
 LEAST_OPACITY = 1e-5  # and the greatest is as far from 1: of formats that hold no logits
+
+
+def raw_of(gaussians: Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:
+    """The raw parameters in a file, float32."""
+    arrays = {"means3D": gaussians.means3D, "dc": gaussians.dc, "shs": gaussians.shs,
+              "opacities": gaussians.opacity_logits, "scales": gaussians.log_scales, "rotations": gaussians.rotations}
+    return {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
 from ..system.process import pip_install
-from .rows import rotatable_rows, y_up
+from .shown import rotatable_rows, y_up
 
 # Bits behind the point of a coordinate, which has 24 bits. The fewest reach to 8192 units, in steps of a thousandth.
 FEWEST_FRACTIONAL_BITS, MOST_FRACTIONAL_BITS = 10, 20

@@ -6,7 +6,7 @@ import numpy as np
 from diff_smoe_rasterization.io import Gaussians
 
 from ..scenes.pointcloud import SH_C0
-from .rows import logits, rotatable_rows
+from .shown import logits, rotatable_rows
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 

@@ -11,9 +11,8 @@ from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
-from ..results.modelfile import FAINT_BELOW
 from ..scenes.pointcloud import SH_C0
-from .rows import logits, rotatable_rows, sigmoid, y_up
+from .shown import FAINT_BELOW, logits, rotatable_rows, sigmoid, y_up
 
 SPLATTING = "KHR_gaussian_splatting"
 BLEND = "DSMOE_gaussian_splatting_blend"
