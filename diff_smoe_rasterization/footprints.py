@@ -77,19 +77,25 @@ class Footprints(NamedTuple):
     def around(self, width: int) -> Footprints:
         """Those of an equirectangular image of this width, and the footprints that cross its seam on both sides of it.
 
-        The second copy of a footprint follows the others, moved by the width. Radii count 3 sigma: what lies beyond is
-        still cut. The host waits for the number of copies. Raises ValueError for a width below 1.
+        Copies, moved by the width, follow the others: those of `copied`. The host waits for their number. Raises
+        ValueError for a width below 1.
         """
-        if width < 1:
-            raise ValueError(f"around: width is {width}; it must be that of the equirectangular image, 1 or more")
-        left = ((self.radii > 0) & (self.gates[:, 0] < self.radii)).nonzero().squeeze(1)
-        right = ((self.radii > 0) & (self.gates[:, 0] > width - 1 - self.radii)).nonzero().squeeze(1)
         parts = [self]
-        for index, step in ((left, width), (right, -width)):
+        for index, step in zip(self.copied(width), (width, -width)):
             shift = self.gates.new_tensor([step, *[0] * (GATE_NUMBERS - 1)])
             copies = self.rows(index)
             parts.append(copies._replace(gates=copies.gates + shift))
         return Footprints.joined(parts)
+
+    def copied(self, width: int) -> Tuple[torch.Tensor, torch.Tensor]:
+        """Which footprints `around` copies, int64: to the right those at the left border, then those at the right."""
+        if width < 1:
+            raise ValueError(f"around: width is {width}; it must be that of the equirectangular image, 1 or more")
+        column, faintest = self.gates[:, 0], _core.constants["every_tail_alpha"]
+        squared = (2 * (self.opacities / faintest).log()).maximum(self.gates[:, _REACH])  # in sigmas, in any mode
+        reach = self.radii * squared.clamp(min=9).sqrt() / 3
+        return (((self.radii > 0) & (column < reach)).nonzero().squeeze(1),
+                ((self.radii > 0) & (column > width - 1 - reach)).nonzero().squeeze(1))
 
     @staticmethod
     def joined(parts: Sequence[Footprints]) -> Footprints:

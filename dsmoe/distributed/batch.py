@@ -16,8 +16,9 @@ from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 from diff_smoe_rasterization.splats import Splats
 
 from ..model import PARAMETERS, GaussianModel
+from ..scenes.images import View
 from ..system.group import Group
-from ..training.strategy import Look
+from ..training.strategy import Look, look_at
 from .rows import ViewRows
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -25,9 +26,13 @@ _RECORD = GATE_GRADIENTS + 3  # numbers: gradients by a row
 
 
 class DrawnImage:
-    """One view as this process has blended it."""
+    """One view as this process has blended it, a panorama without a seam."""
 
     def __init__(self, footprints: Footprints, settings: GaussianRasterizationSettings, for_backward: bool) -> None:
+        self._copied: Sequence[torch.Tensor] = ()
+        if settings.camera_model == "equirectangular":
+            self._copied = footprints.copied(settings.image_width)
+            footprints = footprints.around(settings.image_width)
         self.radii = footprints.radii
         self._tensors, self._options = blend_op_arguments(footprints, settings)
         self._options = (*self._options, for_backward)
@@ -35,19 +40,28 @@ class DrawnImage:
         self._images = images
         self.color: torch.Tensor = images[0]  # [C, H, W]
 
-    def splats(self) -> Splats:
-        """What the pixels say of each footprint."""
+    def look(self, view: View, target: torch.Tensor) -> Look:
+        """At the footprints. target: what the view's image is compared with."""
         color, gate_sum, *_ = self._images
         inputs = dict(zip(("radii", "bg", "background_gate"), self._tensors[2:]))
-        return Splats([color, self.radii, gate_sum], self._saved, [inputs.get(name) for name in INPUTS],
-                      self._options[:-1])
+        splats = Splats([color, self.radii, gate_sum], self._saved, [inputs.get(name) for name in INPUTS],
+                        self._options[:-1])
+        return Look(*map(self._with_copies, look_at(view, target, color, splats)))
 
     def backward(self, dL_dcolor: torch.Tensor, wants_gate: bool) -> Tuple[torch.Tensor, torch.Tensor]:
         """Gradients by the footprints, [M, 6 + F], and by the background's gate, [1], or [0] if it is not wanted."""
         radii, bg, gate = self._tensors[2:]
         records, _, dL_dgate = _OPS.blend_backward(dL_dcolor, None, None, None, self._images, self._saved, radii, bg,
                                                    gate, *self._options, wants_gate)
-        return records, dL_dgate
+        return self._with_copies(records), dL_dgate
+
+    def _with_copies(self, rows: torch.Tensor) -> torch.Tensor:
+        """Rows of the footprints, with those of their copies added; rows: of these too, [M + copies, ...]."""
+        lengths = [len(index) for index in self._copied]
+        own, *copies = rows.split([len(rows) - sum(lengths), *lengths])
+        for index, part in zip(self._copied, copies):
+            own[index] += part  # no index is there twice
+        return own
 
 
 class Batch:

@@ -14,7 +14,7 @@ from ..system.group import Group
 from ..training.gate import LearnedGate
 from ..training.passes import Passes, add_gradient
 from ..training.step_parts import Compare, ViewOver
-from ..training.strategy import Look, Step, look_at
+from ..training.strategy import Look, Step
 from .batch import Batch
 
 
@@ -68,7 +68,7 @@ class BatchPasses(Passes):
             view, image = drawn
             target, loss, gradient = compare(views[view], image.color)
             if view in looked:
-                looks[view] = look_at(views[view].view, target, image.color, image.splats())
+                looks[view] = image.look(views[view].view, target)
             records, dL_dgate = image.backward(gradient, self.gate is not None)
             numbers[0, view] = loss
             if self.gate:
@@ -94,5 +94,5 @@ class BatchPasses(Passes):
             drawn = batch.draw(0, for_backward=False)
             if drawn:
                 view, image = drawn
-                looks[view] = look_at(some[view], some[view].image, image.color, image.splats())
+                looks[view] = image.look(some[view], some[view].image)
             yield from batch.looks(looks, range(len(some)))

@@ -90,8 +90,12 @@ class BatchTrainer(Trainer):
 
 def new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None,
                 group: Optional[Group] = None) -> Trainer:
-    """The trainer of a run: the usual one for one view a step in one process. Raises TrainerError."""
-    if config.batch == 1 and (group is None or group.size == 1):
+    """The trainer of a run: the usual one for one view a step in one process, but of panoramas. Raises TrainerError.
+
+    Only batches draw a panorama without a seam.
+    """
+    around = rasterize is None and any(view.camera.is_panorama for view in scene.train)
+    if config.batch == 1 and (group is None or group.size == 1) and not around:
         return Trainer(config, scene, rasterize)
     if rasterize is not None:
         raise TrainerError("train: rasterize is given; batches of views and several processes need the package's own")

@@ -30,6 +30,16 @@ def package_rasterizer() -> Rasterize:
     return rasterize
 
 
+def _rasterize_around(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+                      outputs: Sequence[str] = (), **arguments: Any) -> Rendering:
+    """`rasterize` of a panorama, without a seam."""
+    from diff_smoe_rasterization import blend_footprints, project_gaussians
+
+    footprints = project_gaussians(means3D, opacities, settings, outputs=outputs, **arguments)
+    rendering = blend_footprints(footprints.around(settings.image_width), settings, outputs)
+    return rendering._replace(radii=footprints.radii)
+
+
 class Renderer:
     """Renders a model with one blend mode and background; the only place where the settings of a view are made."""
 
@@ -58,7 +68,10 @@ class Renderer:
 
         arguments: further ones of `rasterize`, means2D or outputs, or colors_precomp in place of the SH colours.
         """
-        return self._render(self.rasterize, camera, background, background_gate, **arguments)
+        function = self.rasterize
+        if camera.is_panorama and function is package_rasterizer():
+            function = _rasterize_around
+        return self._render(function, camera, background, background_gate, **arguments)
 
     def with_splats(self, camera: Camera, background: Optional[torch.Tensor] = None,
                     background_gate: Optional[torch.Tensor] = None,

@@ -11,7 +11,7 @@ import torch
 from diff_smoe_rasterization.camera import settings_from_camera
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
-from .lens import Lens
+from .lens import AROUND, Lens
 
 LARGEST = 1e9  # of all numbers of a camera, pixels or world units: with larger ones float32 overflows
 
@@ -38,6 +38,11 @@ class Camera:
     def center(self) -> np.ndarray:
         """[3] the camera's position in the world."""
         return -self.rotation.T @ self.translation
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the image has all directions, and so a seam."""
+        return self.lens is not None and self.lens.model == AROUND
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another image size; intrinsics scale with the axes."""

@@ -9,6 +9,7 @@ from typing import Dict, Optional, Sequence, Tuple
 import numpy as np
 
 from diff_smoe_rasterization import io
+from diff_smoe_rasterization.settings import CAMERA_MODELS
 
 # By camera model of COLMAP: how many focal lengths it has, whether it is a fisheye, and its coefficients.
 MODELS: Dict[str, Tuple[int, bool, Tuple[str, ...]]] = {
@@ -29,13 +30,9 @@ MODELS: Dict[str, Tuple[int, bool, Tuple[str, ...]]] = {
 THIN_PRISM, AROUND = "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"  # which OpenCV does not undistort
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # the order of OpenCV's coefficients
 FISHEYE = ("k1", "k2", "k3", "k4")
-# By the rasterizer's camera model: how many coefficients a lens may have.
-COUNTS = {"opencv": (0, 1, 2, 4, 5, 8, 12), "fisheye": (0, 1, 2, 4), "thin_prism_fisheye": (0, 8),
-          "equirectangular": (0,)}
 MAX_ASPECT_ERROR = 0.02  # of an image of all directions
 LEAST_REACH = 0.1  # of the shorter side: what a lens shows around its principal point
 SAMPLES = 4096  # of the distortion along a radius
-MOST_SLOPE, FISHEYE_END = 1e3, 0.97 * math.pi  # as the rasterizer has them: there a lens ends that does not before
 
 
 @dataclass(frozen=True)
@@ -55,20 +52,17 @@ class Lens:
     @property
     def reach(self) -> float:
         """The distorted radius, for a focal length of 1, up to which an image shows something; infinite if all does."""
-        return math.inf if self.model == AROUND else float(self.radii[1][-1])
+        distorted = self.radii[1]
+        return float(distorted[-1]) if len(distorted) else math.inf
 
     def check(self, focal: float, width: int, height: int) -> None:
         """Raises ValueError for a lens that cannot be that of such images.
 
         focal: the longer focal length, pixels.
         """
-        counts, numbers = COUNTS[self.camera_model], list(self.coefficients)
-        if len(numbers) not in counts or not np.isfinite(numbers).all():
-            raise ValueError(f"the distortion of a lens {self.camera_model} is {numbers}; it must be "
-                             f"{' or '.join(map(str, counts))} finite numbers")
         if not self.reach * focal >= LEAST_REACH * min(width, height):
             raise ValueError(f"the lens folds the image back at {self.reach * focal:.2g} pixels from the principal "
-                             f"point, and shows nothing beyond; its distortion is {numbers}")
+                             f"point, and shows nothing beyond; its distortion is {list(self.coefficients)}")
         if self.model == AROUND and abs(width / (2 * height) - 1) > MAX_ASPECT_ERROR:
             raise ValueError(f"an image of all directions must be twice as wide as it is high, and is {width}x{height}")
 
@@ -76,25 +70,13 @@ class Lens:
     def radii(self) -> Tuple[np.ndarray, np.ndarray]:
         """[n] and [n], rising from 0: undistorted radii, and the distorted ones for a focal length of 1.
 
-        They end where the distorted radius stops rising. An undistorted radius is the angle to the axis of a fisheye,
-        else its tangent. EQUIRECTANGULAR has none.
+        The core has them, up to where the distorted radius stops rising. An undistorted radius is the angle to the axis
+        of a fisheye, else its tangent. EQUIRECTANGULAR has none. Raises ValueError for coefficients that cannot be.
         """
-        values = dict(zip(MODELS[THIN_PRISM][2] if self.model == THIN_PRISM else FISHEYE if self.is_fisheye
-                          else PERSPECTIVE, self.coefficients))
-        k = [values.get(f"k{index}", 0.0) for index in range(1, 7)]
-        with np.errstate(all="ignore"):  # what is not finite ends the range
-            if self.is_fisheye:
-                radius = np.linspace(0, FISHEYE_END, SAMPLES)
-                square, under = radius**2, np.ones(SAMPLES)
-                distorted = radius * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
-            else:
-                radius = np.tan(np.linspace(0, math.atan(MOST_SLOPE), SAMPLES))
-                square = radius**2
-                under = 1 + square * (k[3] + square * (k[4] + square * k[5]))
-                distorted = radius * (1 + square * (k[0] + square * (k[1] + square * k[2]))) / under
-            falls = np.flatnonzero(~((np.diff(distorted) > 0) & (under[1:] > 0) & np.isfinite(distorted[1:])))
-        end = falls[0] + 1 if len(falls) else SAMPLES
-        return radius[:end], distorted[:end]
+        from diff_smoe_rasterization.core import _core  # which is not asked for before: it may not be built
+
+        radii = _core.lens_radii(CAMERA_MODELS.index(self.camera_model), self.coefficients, SAMPLES)
+        return np.array(radii[0]), np.array(radii[1])
 
 
 def lens_of(model: str, is_fisheye: bool, coefficients: Dict[str, float]) -> Optional[Lens]:

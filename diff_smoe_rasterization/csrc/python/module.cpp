@@ -2,6 +2,10 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <cmath>
+#include <utility>
+#include <vector>
+
 #include "dsmoe/allocator.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/blend.h"
@@ -98,6 +102,28 @@ py::dict blend_modes() {
   return modes;
 }
 
+// The radial part of a lens: radii on its plane, from 0 to the end of its range and evenly by their angle, and the
+// distorted ones for a focal length of 1, which rise. Empty if the model has no range. Raises ValueError for wrong
+// coefficients.
+std::pair<std::vector<double>, std::vector<double>> lens_radii(int camera_model, std::vector<double> coefficients,
+                                                               int count) {
+  using namespace lens_making;
+  LensCalibration of;
+  of.model = static_cast<LensModel>(camera_model), of.distortion = std::move(coefficients);
+  const Distortion<double> d = distortion_of(of);
+  std::vector<double> radii, distorted;
+  const bool slopes = of.model == LensModel::kOpencv;
+  if (!slopes && of.model != LensModel::kFisheye && of.model != LensModel::kThinPrismFisheye) return {};
+  const double range = range_of(d, slopes ? kMostSlope : kFisheyeEnd, slopes);
+  for (int i = 0; i < count; ++i) {
+    const double part = i / (count - 1.0), r = slopes ? std::tan(part * std::atan(range)) : part * range;
+    const double bent = r * radial_of(d, r * r).value;
+    if (i > 0 && !(bent > distorted.back() && std::isfinite(bent))) break;  // coefficients at which float64 overflows
+    radii.push_back(r), distorted.push_back(bent);
+  }
+  return {radii, distorted};
+}
+
 // Raises ValueError if DSMOE_SIMD names no level of this processor.
 py::dict build_info() {
 #ifdef DSMOE_WITH_CUDA
@@ -141,6 +167,7 @@ PYBIND11_MODULE(_core, module) {
   module.attr("options") = options();
   module.attr("saved") = saved();
   module.def("build_info", &build_info);
+  module.def("lens_radii", &lens_radii);
 #ifdef DSMOE_WITH_CUDA
   module.def("recent_instances", &cuda::recent_instances);
 #endif
