@@ -27,6 +27,7 @@ from .layout import Layout, PosedImage, check_lenses, with_lenses, with_masks, w
 from .modelfolder import CAMERAS, read_model_layout, rendered_views
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
+from .straight import EVERY
 from .undistortion import trains_natively, undistorted
 
 if TYPE_CHECKING:
@@ -136,7 +137,8 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
         why = ", since undistortion would cut off much of them" if chosen else ""
         masked = any(shown_by_lens(view.camera) is not None for view in views)
         lines.append(f"images of camera model {', '.join(models)} stay as they are{why}; Gaussians are projected "
-                     f"through it{', pixels beyond the lens are masked' * masked}")
+                     f"through it, in a training each {EVERY}th time by a pinhole camera"
+                     f"{', pixels beyond the lens are masked' * masked}")
     if config.batch > len(scene.train):
         lines.append(f"note: a step of --batch {config.batch} shows some of the {len(scene.train)} training images "
                      "more than once")

@@ -17,6 +17,7 @@ from ..results.rendering import Rasterize, Renderer, background_color
 from ..results.shown import raw_of
 from ..scenes.images import View
 from ..scenes.scene import Scene, difference_of, scene_fingerprint
+from ..scenes.straight import StraightViews
 from ..system.group import ALONE
 from ..system.stopwatch import Stopwatch
 from .gate import LearnedGate
@@ -58,7 +59,9 @@ class Trainer:
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),
             faint_below=config.faint_below, deterministic=config.deterministic)
-        self.renderer.prepare([view.camera for view in self.scene.train])
+        cameras = [view.camera for view in self.scene.train]
+        self.straight = StraightViews(cameras)
+        self.renderer.prepare([*cameras, *self.straight.cameras])
         self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
             lambda views: self.passes.look(views), self.shards))
@@ -165,7 +168,8 @@ class Trainer:
 
     def _next_views(self) -> List[ViewOver]:
         config = self.config
-        views = [self.scene.train[self.order.next()] for _ in range(config.batch)]
+        first = self.iteration - config.batch + 1
+        views = [self.straight.of(self.scene.train[self.order.next()], first + index) for index in range(config.batch)]
         return [ViewOver(view, torch.rand(3, device=config.device) if config.random_background else None)
                 for view in views]
 

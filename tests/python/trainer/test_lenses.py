@@ -25,7 +25,9 @@ from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
+from dsmoe.scenes.straight import EVERY, straightened
 from dsmoe.system.files import ABANDONED, PART
+from dsmoe.training.trainer import Trainer
 
 WIDTH, HEIGHT = 96, 72
 FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0
@@ -91,13 +93,18 @@ LENSES = [
 ]
 
 
-@needs_opencv
+def straight(view):
+    return straightened(view, view.camera.pinhole())
+
+
+@pytest.mark.parametrize("how", [pytest.param("undistort", marks=needs_opencv), "native"])
 @pytest.mark.parametrize("model, two_focals, k", LENSES)
-def test_every_model_becomes_a_pinhole_camera(tmp_path, monkeypatch, model, two_focals, k):
+def test_every_model_becomes_a_pinhole_camera(tmp_path, monkeypatch, model, two_focals, k, how):
+    """By OpenCV before a training, or beside the images in one through the lens."""
     monkeypatch.setitem(globals(), "FY", FY if two_focals else FX)
     params = [*([FX, FY] if two_focals else [FX]), CX, CY, *k]
     folder = write_scene(tmp_path, model, params, bent_image(model, k))
-    view = load(folder).train[0]
+    view = load(folder).train[0] if how == "undistort" else straight(load(folder, "native").train[0])
     camera = view.camera
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (WIDTH, HEIGHT, FX, FY, CX, CY)
     x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / FX, (np.arange(HEIGHT) + 0.5 - CY) / FY)
@@ -181,6 +188,27 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
     assert main(["render", output, "--orbit", "--frames", "2", "-o", str(tmp_path / "orbit"), "--device", "cpu"]) == 0
     assert main(["train", "--resume", output, "--lenses", "undistort", "--iterations", "201"]) == 1
     assert "undistort" in capsys.readouterr().err
+
+
+def test_a_training_through_a_lens_shows_pinhole_images_too(tmp_path):
+    """Of so many steps one, by the pose of its photograph; else viewers would show haze that no view shows."""
+    config = TrainConfig(scene=fisheye_scene(tmp_path), lenses="native", test_every=0, device="cpu", blend_mode="alpha",
+                         iterations=2 * EVERY + 1).validate()
+    trainer = Trainer(config, load_scene(config, progress=False))
+    shown = [trainer.step().view.camera for _ in range(config.iterations)]
+    pinholes = [camera for camera in shown if not camera.lens]
+    assert pinholes == [shown[EVERY - 1], shown[2 * EVERY - 1]]
+    poses = {f"{view.camera.name} (pinhole)": view.camera for view in trainer.scene.train}
+    for camera in pinholes:
+        assert (camera.center == poses[camera.name].center).all() and camera.fx == WIDTH / 2, "90 degrees across"
+
+
+def test_pinhole_images_keep_masks(tmp_path):
+    folder = write_scene(tmp_path, "OPENCV_FISHEYE", [FX, FY, CX, CY, *LENSES[5][2]], Image.new("RGB", (WIDTH, HEIGHT)))
+    half_mask(tmp_path)
+    view = load(folder, "native").test[0]
+    mask, middle = straight(view).mask[0].numpy(), WIDTH // 2  # near the axis, so it stays
+    assert not mask[:, :middle - 3].any() and (mask[5:-5, middle + 3:-5] == 255).all()
 
 
 def seen_by_pinhole(lens, width, height, fx, fy, cx, cy):
@@ -305,7 +333,7 @@ def test_a_panorama_has_no_seam(tmp_path, mode):
         trainer = new_trainer(config, load_scene(config, progress=False))
         with torch.no_grad():
             trainer.model.raw["scales"] -= 1  # none is wider than the image
-        losses = [float(trainer.step().loss) for _ in range(20)]
+        losses = [float(trainer.step().loss) for _ in range(EVERY - 1)]  # a pinhole would look another way
         color = trainer.renderer(trainer.scene.train[0].camera).color.detach()
         runs.append((losses, trainer.whole_model().raw["means3D"], color.roll(-32 * turned, 2)))
         cut = trainer.renderer.with_splats(trainer.scene.train[0].camera)[0].color

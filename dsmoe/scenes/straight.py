@@ -1,0 +1,75 @@
+"""Photographs through lenses as a pinhole camera would have taken them: a training through a lens shows some of these.
+
+The footprint of a Gaussian far beside the image is a coarse approximation, and through a lens another one than through
+a pinhole. What no training view showed would lie as haze over the pinhole images of viewers.
+"""
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import List, Sequence, Tuple
+
+import numpy as np
+import torch
+
+from .cameras import Camera
+from .images import View
+
+EVERY = 16  # of so many views through lenses, one is shown by a pinhole
+
+
+class StraightViews:
+    """The pinhole images of views through lenses; they are made anew each time, as they would take as much memory."""
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        self._straight = {camera.name: dataclasses.replace(camera.pinhole(), name=f"{camera.name} (pinhole)")
+                          for camera in cameras if camera.lens}
+
+    @property
+    def cameras(self) -> List[Camera]:
+        """All that `of` may give."""
+        return [*self._straight.values()]
+
+    def of(self, view: View, iteration: int) -> View:
+        """What the training shows in this iteration: the view, or in each so many one, what a pinhole camera sees."""
+        camera = self._straight.get(view.camera.name)
+        return view if camera is None or iteration % EVERY else straightened(view, camera)
+
+
+def straightened(view: View, camera: Camera) -> View:
+    """A view through a lens by a pinhole camera in its place. What the photograph does not show is masked."""
+    grid, shown = _places(dataclasses.replace(view.camera, name="", rotation=None, translation=None),
+                          dataclasses.replace(camera, name="", rotation=None, translation=None), str(view.image.device))
+
+    def seen(planes: torch.Tensor, mode: str) -> torch.Tensor:
+        values = torch.nn.functional.grid_sample(planes[None].float(), grid, mode, "border", align_corners=False)
+        return values[0].round().clamp(0, 255).to(torch.uint8)
+
+    mask = shown if view.mask is None else torch.minimum(seen(view.mask, "bilinear"), shown)
+    return dataclasses.replace(view, camera=camera, image=seen(view.image, "bicubic"), mask=mask,
+                               opacity=None if view.opacity is None else seen(view.opacity, "bicubic"))
+
+
+@functools.lru_cache(maxsize=4)
+def _places(bent: Camera, straight: Camera, device: str) -> Tuple[torch.Tensor, torch.Tensor]:
+    """Where the pixels of a pinhole camera lie on the bent image, [1, H, W, 2] as `grid_sample` takes it.
+
+    And [1, H, W] uint8: 255 where the image shows them, else 0. The cameras have the same pose, which does not matter.
+    The rasterizer says it of a point on each pixel's ray.
+    """
+    from diff_smoe_rasterization import project_gaussians  # late: a scene needs no extension
+
+    x = (torch.arange(straight.width, device=device) + 0.5 - straight.cx) / straight.fx
+    y = (torch.arange(straight.height, device=device) + 0.5 - straight.cy) / straight.fy
+    y, x = (axis.flatten() for axis in torch.meshgrid(y, x, indexing="ij"))
+    points = torch.stack([x, y, torch.ones_like(x)], dim=1)
+    camera = dataclasses.replace(bent, rotation=np.eye(3), translation=np.zeros(3))
+    settings = camera.settings(torch.zeros(3, device=device), 0, "alpha")
+    prints = project_gaussians(points, points[:, 2], settings, colors_precomp=points,
+                               scales=torch.full_like(points, 1e-6),
+                               rotations=torch.eye(4, device=device)[:1].expand(len(points), -1))
+    size = torch.tensor([bent.width, bent.height], device=device)
+    places = (2 * prints.means2D + 1) / size - 1  # -1 and 1 are the outer edges of the image's pixels
+    shown = (prints.radii > 0) & (places.abs() <= 1).all(1)
+    shape = (1, straight.height, straight.width)
+    return places.masked_fill(~shown[:, None], -1).view(*shape, 2), (255 * shown).to(torch.uint8).view(shape)
