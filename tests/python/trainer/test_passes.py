@@ -12,6 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
 from dsmoe.model import PARAMETERS
+from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
 from dsmoe.training.graphs import IDLE, MOST_KINDS, MOST_SEEN, WARM_UP, Graphs
@@ -150,14 +151,19 @@ def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
     dict(blend_mode="alpha", strategy="mcmc", budget=60),
     dict(blend_mode="smoe", strategy="importance", budget=60, strategy_options="views=3,moves=0.2", iterations=50)],
     ids=str)
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("images", ["plain", "masked", "bent"])
 @pytest.mark.parametrize("graphs", [Repeats, pytest.param(Recorded, marks=pytest.mark.skipif(
     not hasattr(torch.autograd, "_unsafe_preserve_version_counter"), reason="this torch counts all changes"))])
-def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypatch, options, masked, graphs):
+def test_repeated_steps_are_those_that_are_launched(tiny_config, scene, monkeypatch, options, images, graphs):
     """Whatever comes between: densifications, looks, evaluations, other losses, degrees, backgrounds and an average."""
     monkeypatch.setattr("dsmoe.training.graphs.WARM_UP", 3)
     monkeypatch.setattr("diff_smoe_rasterization.lazy_adam._CAPACITY", 7)
-    if masked:
+    if images == "bent":  # some steps show them by a pinhole
+        monkeypatch.setattr("dsmoe.scenes.straight.EVERY", 4)
+        lens = lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})
+        scene = dataclasses.replace(scene, train=[dataclasses.replace(view, camera=dataclasses.replace(
+            view.camera, lens=lens)) for view in scene.train])
+    if images == "masked":
         mask = torch.randint(0, 256, (1, 24, 32), dtype=torch.uint8)
         views = [dataclasses.replace(view, mask=mask if index % 3 else None) for index, view in enumerate(scene.train)]
         scene = dataclasses.replace(scene, train=views)
