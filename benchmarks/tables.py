@@ -272,7 +272,7 @@ def table_2() -> str:
 
 
 def changed_2024() -> List[float]:
-    """PSNR of smoe less alpha's in the 3DGS of 2024: as it is, without its clamp, with the opacity rate of 2023, both."""
+    """PSNR of smoe less alpha's in the 3DGS of 2024: as it is, without its clamp, with 2023's opacity rate, both."""
     psnr = {row["cell"]: row["psnr"] for row in rows_of("table2_h200.jsonl") if row["suite"] == "trainer-2024"}
     return [psnr[f"3dgs-2024{change}_bonsai-half_smoe-learned_s0"] - psnr[f"3dgs-2024{change}_bonsai-half_alpha_s0"]
             for change in ("", "-noclamp", "-opacity", "-noclamp-opacity")]
@@ -420,11 +420,11 @@ def presets_table() -> str:
     """3DGS densification, the default at two lengths and --best."""
     columns = {"3DGS densification": "--strategy 3dgs", "default": "none", "15,000 iterations": "--iterations 15000",
                "`--best`": "--best"}
-    lines = []
-    for (scene, blend), found in sorted(preset_cells().items(), key=lambda item: (SCENES.index(item[0][0]), item[0][1])):
+    lines, cells = [], preset_cells()
+    for scene, blend in sorted(cells, key=lambda key: (SCENES.index(key[0]), key[1])):
         texts = {options: f"{shown(rows, 'psnr', 2)}, {mean(rows, 'ssim'):.3f}, "
                  f"{statistics.fmean(lpips):.3f}; {thousands(rows)}"
-                 for options, rows in found.items()
+                 for options, rows in cells[scene, blend].items()
                  if (lpips := [row["lpips_alex"] for row in rows if row["lpips_alex"] is not None])}
         lines.append([f"{scene}, {blend}", *(texts.get(options, "–") for options in columns.values())])
     return table(["PSNR, SSIM, LPIPS; Gaussians", *columns], lines)
@@ -528,8 +528,8 @@ def sentences() -> Dict[str, List[str]]:
             f"changes by {hac_gains} dB", f"{span(equal_gains, 2, '+')} dB at equal size",
             f"Taming, whose number is given, by {taming} dB where sparse and, by the authors' program, "
             f"{taming_dense:+.2f} dB where dense",
-            "The loss of the 3DGS of 2024 ({:.1f} dB here) stays without its clamp ({:.1f}), with the opacity rate of 2023 "
-            "({:.1f}) and with both ({:.1f})".format(*changed_2024()),
+            "The loss of the 3DGS of 2024 ({:.1f} dB here) stays without its clamp ({:.1f}), with the opacity rate of "
+            "2023 ({:.1f}) and with both ({:.1f})".format(*changed_2024()),
             f"{-min(equal_sizes):.0f} % smaller to {max(equal_sizes):.0f} % larger at equal PSNR",
             "-{:.1f} dB on bonsai, -{:.1f} on fox, ".format(*newest_loss)
             + f"with {span(fewer(smoe, alpha) for alpha, smoe in newest)} % fewer",
