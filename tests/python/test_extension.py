@@ -1,6 +1,7 @@
 """The compiled extension: what it says when it cannot be loaded, and what its ops refuse when called directly."""
 from __future__ import annotations
 
+import datetime
 import importlib.util
 import os
 import re
@@ -168,6 +169,17 @@ def test_an_unknown_instruction_set_is_refused_with_those_that_there_are():
 def test_a_plain_import_registers_the_ops():
     code = "import torch, diff_smoe_rasterization; print(torch.ops.diff_smoe_rasterization.rasterize)"
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, cwd=WHERE_THE_PACKAGE_LIES)
+
+
+@pytest.mark.skipif(not hasattr(torch.distributed, "DistStoreError"), reason="this PyTorch has no DistStoreError")
+def test_errors_of_pytorch_stay_its_own():
+    """pybind11 asks translators of all modules that were built by the same version of it."""
+    store = torch.distributed.HashStore()
+    store.set_timeout(datetime.timedelta(milliseconds=1))
+    with pytest.raises(torch.distributed.DistStoreError):
+        store.get("absent")
+    with pytest.raises(IndexError):
+        torch.ops.aten.index.Tensor(torch.zeros(3), [torch.tensor([9])])
 
 
 def test_build_info_tells_what_runs():

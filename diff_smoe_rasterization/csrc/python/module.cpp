@@ -155,7 +155,7 @@ py::dict stage_times() {
 }  // namespace
 
 PYBIND11_MODULE(_core, module) {
-  py::register_exception_translator(&python::translate_exception);
+  py::register_local_exception_translator(&python::translate_exception);  // a global one would take PyTorch's, too
   module.attr("constants") = constants();
   module.attr("blend_modes") = blend_modes();
   module.attr("camera_models") =
