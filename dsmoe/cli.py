@@ -212,6 +212,9 @@ def _train_in(group: Group, config: TrainConfig, layout: Optional[Layout], argum
         whose = "that of the model" if config.init else "chosen for the scene"
         print(f"note: that number is {whose}; --budget N makes more or fewer, and --strategy 3dgs is the "
               "densification of 3DGS")
+        if config.iterations < TrainConfig.iterations and not (
+                hasattr(arguments, "iterations") or arguments.fast or arguments.best):
+            print("note: fewer iterations, as the scene has few photographs; --iterations N sets another number")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,

@@ -86,7 +86,9 @@ class TrainConfig:
         None, "smoe, smoe_eq7: where near pairs have a gate sum below this, faint pairs and tails count too; 2: "
               "everywhere, as in the program of the paper's authors (default: $DSMOE_FAINT_BELOW, else 0.25 in smoe, 2 "
               "in smoe_eq7)")
-    iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
+    iterations: int = _option(
+        30_000, "views to train on, a view each step; with --batch B, B each step. importance takes fewer for few "
+                "photographs where it also chooses the number of Gaussians")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
     resolution: int = _option(

@@ -9,7 +9,7 @@ from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MOD
 
 from ..errors import ConfigError
 from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
-from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, with_preset
+from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, iterations_for_scene, with_preset
 
 if TYPE_CHECKING:
     from ..scenes.layout import Layout
@@ -113,8 +113,10 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
     given = given_options(arguments)
     preset = next((name for name in PRESETS if getattr(arguments, name, False)), None)
     options = with_preset(given, preset, given.get("device", "cpu"))
+    chooses, layout = options["strategy"] == STRATEGY, None
+    if chooses and earlier:
+        options = {"iterations": earlier.iterations, **options}
     config = TrainConfig(**options)
-    chooses, layout = config.strategy == STRATEGY, None
     if chooses or getattr(arguments, "scale_recipe", False):
         config = dataclasses.replace(config.shortened(), **options)
     if chooses and earlier:
@@ -127,6 +129,8 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
         from ..scenes.scene import read_layout
 
         layout = read_layout(config)
+        options = {**options, "iterations": iterations_for_scene(config, options, layout)}
+        config = dataclasses.replace(dataclasses.replace(config, **options).shortened(), **options)
         config = dataclasses.replace(config, **chosen_for_scene(config, given, layout))
     if earlier:
         earlier.check_continued_by(config)

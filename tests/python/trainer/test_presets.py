@@ -8,8 +8,9 @@ from test_cli import fails, results_of
 from test_scene_loading import nerf_folder  # noqa: F401
 
 from dsmoe.cli import main
+from dsmoe.options import presets
 from dsmoe.options.config import TrainConfig
-from dsmoe.options.presets import NUMBERS, Numbers, chosen_for_scene, with_preset
+from dsmoe.options.presets import NUMBERS, Numbers, chosen_for_scene, iterations_for_scene, with_preset
 from dsmoe.scenes import scene
 from dsmoe.scenes.scene import read_layout
 
@@ -112,3 +113,33 @@ def test_as_many_points_are_taken_as_time_allows(tiny_scene, monkeypatch):
     assert chosen_for_scene(config, (), layout) == {"init_points": 60, "budget": 120}
     given = dataclasses.replace(config, init_points=70)
     assert chosen_for_scene(given, ("init_points",), layout) == {"budget": 140}
+
+
+@pytest.mark.parametrize("views, iterations", [(1, 15_000), (50, 15_000), (60, 18_000), (100, 30_000), (500, 30_000)])
+def test_few_photographs_train_for_fewer_iterations(tiny_scene, views, iterations):
+    """A training view is seen 300 times, but for the bounds."""
+    def chosen(*given, **options):
+        config = TrainConfig(scene=tiny_scene, strategy="importance", blend_mode="smoe", **options)
+        layout = read_layout(config)
+        return iterations_for_scene(config, given, dataclasses.replace(layout, train=layout.train[:1] * views))
+
+    assert chosen() == iterations
+    assert chosen(batch=1000) == iterations, "a multiple of the batch"
+    assert chosen(batch=16) == {15_000: 15_008, 18_000: 18_000, 30_000: 30_000}[iterations]
+    assert chosen(budget=70) == chosen("iterations") == chosen("densify_until_iter") == 30_000
+
+
+def test_the_milestones_follow_the_chosen_iterations(tiny_scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(presets, "LEAST_ITERATIONS", 20)
+    monkeypatch.setattr(presets, "PER_VIEW", 1)
+    output = str(tmp_path / "out")
+    words = ["train", tiny_scene, "-o", output, "--quiet", "--rotation-lr", "0.003"]
+    assert main(words) == 0
+    assert "note: fewer iterations, as the scene has few photographs" in capsys.readouterr().out
+    config = TrainConfig.load(output)
+    assert (config.iterations, config.densify_until_iter, config.position_lr_max_steps) == (20, 10, 20)
+    assert (config.rotation_lr, config.budget) == (0.003, 144 * 2**3), "growth doubles 144 points at 2, 3 and 4"
+    for more in ([], ["--scale-recipe"]):
+        assert main([*words, "--resume", *more]) == 0, "it keeps its length"
+    assert main([*words, "--overwrite", "--iterations", "20"]) == 0
+    assert "note: fewer iterations" not in capsys.readouterr().out
