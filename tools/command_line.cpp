@@ -11,6 +11,13 @@
 
 namespace dsmoe::tools {
 
+namespace {
+
+// A path whole, however long: its end tells which file it is.
+std::string quoted(const std::string& path) { return '"' + path + '"'; }
+
+}  // namespace
+
 CommandLine::CommandLine(int argc, char** argv, const std::vector<OptionRule>& rules) {
   std::string letters = ":";  // first: getopt leaves the messages to us
   std::vector<option> options;
@@ -90,17 +97,17 @@ void CommandLine::check_output(const std::string& file, const std::string& folde
     for (const fs::path& part : fs::path(file).lexically_relative(folder).parent_path()) {
       place /= part;
       if (fs::is_symlink(place, ignored)) {
-        throw UsageError(io::printable(place.string()) + " is a link, and nothing is written there; -o names another");
+        throw UsageError(quoted(place.string()) + " is a link, and nothing is written there; -o names another");
       }
     }
   }
   const fs::file_status status = fs::symlink_status(file, ignored);
   if (!fs::exists(status)) return;
   if (!fs::is_regular_file(status)) {
-    throw UsageError(io::printable(file) + " is not a regular file, which is never replaced; -o names another");
+    throw UsageError(quoted(file) + " is not a regular file, which is never replaced; -o names another");
   }
   if (!has("overwrite")) {
-    throw UsageError(io::printable(file) + " is there already; --overwrite replaces it, -o names another");
+    throw UsageError(quoted(file) + " is there already; --overwrite replaces it, -o names another");
   }
 }
 

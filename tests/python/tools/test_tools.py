@@ -161,7 +161,7 @@ def test_a_view_of_an_orbit(tmp_path):
 
 
 def test_a_model_that_records_no_blend_is_alpha_and_says_so(tmp_path):
-    picture = ["--orbit", "--frames", 1, "--size", 32, "--device", "cpu", "-o", tmp_path / "out.png"]
+    picture = ["--orbit", "--frames", 1, "--size", 32, "--device", "cpu", "-o", tmp_path / "out.png", "--overwrite"]
     said, pictures = [], []
     for record, more in ((None, []), (None, ["--blend", "alpha"]), ("alpha", [])):
         io.write_gaussians(tmp_path / "model.ply", model(record))
@@ -174,7 +174,7 @@ def test_another_blend_than_the_trained_one_is_said(tmp_path):
     io.write_gaussians(tmp_path / "model.ply", model("smoe", 0.0))
     said = tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "--frames", 1, "--size", 32, "--blend", "alpha",
                 "--device", "cpu", "-o", tmp_path / "out.png")
-    assert "trained with the blend smoe;" in said
+    assert 'trained with the blend "smoe";' in said
 
 
 def test_a_splat_is_drawn_as_its_ply(tmp_path):
