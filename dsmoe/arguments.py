@@ -121,8 +121,8 @@ def build_parser() -> argparse.ArgumentParser:
                         help="of an orbit (default: %(default)s)")
     render.add_argument("--fps", type=number, default=choices.VIDEO_FPS, metavar="X",
                         help=f"of a video (default: {choices.VIDEO_FPS:g})")
-    render.add_argument("--split", choices=("test", "train", "all"), default="test",
-                        help="which cameras (default: test)")
+    render.add_argument("--split", choices=("test", "train", "all"),
+                        help="which cameras (default: test, or train if there are none)")
     _add_model_options(render, "whose cameras are rendered (default: as the model's folder says)")
     render.add_argument("--resolution", type=whole_number, metavar="N",
                         help="as in train (default: the run's, else -1)")

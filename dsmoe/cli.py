@@ -358,8 +358,8 @@ def _render(arguments: argparse.Namespace) -> None:
     if holds_run(arguments.model):
         config, ply = TrainConfig.of_run(arguments.model, "--scene", **overrides), None
     else:
-        config, ply = config_of_model(arguments.model, **overrides)
-        check_cameras(arguments.model, config.scene)
+        config, ply, missing = config_of_model(arguments.model, **overrides)
+        check_cameras(arguments.model, config.scene, missing)
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
                           background_gate=arguments.background_gate, outputs=outputs,
                           overwrite=arguments.overwrite, faint_below=arguments.faint_below)

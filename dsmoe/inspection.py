@@ -154,7 +154,7 @@ def compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
     return f"note: {config.scene} is not the scene that {config.output} was trained on: {difference} here", True
 
 
-def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
+def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: Optional[str] = None,
                   blend_mode: Optional[str] = None, device: str = "cpu",
                   rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
                   outputs: Sequence[str] = (), overwrite: bool = False,
@@ -163,6 +163,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
 
     folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed; with
     `overwrite` any, whose files of the same names are replaced.
+    split: None: the test views, or the training views if there are none, which a line says.
     outputs: "depth" and "alpha" are written beside each. NAME.depth.npy [H, W] float32 is the expected view depth in
     the scene's units, 0 if nothing is hit. NAME.alpha.png has 8 bits, white where Gaussians cover.
 
@@ -176,7 +177,12 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
         renderer, ply, _ = open_run(config, blend_mode, background_gate, device, rasterize, faint_below)
     else:
         renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate, faint_below)
-    cameras = load_cameras(config, split)
+    cameras = load_cameras(config, split or "test")
+    if not cameras and not split:
+        cameras = load_cameras(config, "train")
+        why = " (test_every is 0, as with eval=False in cfg_args)" if config.test_every == 0 else ""
+        print(f"note: scene {printable(config.scene)} has no test views{why}; these are its training views",
+              file=sys.stderr)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views; --split names others")
     return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs, overwrite)
@@ -250,25 +256,31 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
     run's scene is not there. Raises TrainerError.
     """
     check_device(device)
-    so_far = None
+    so_far, missing = None, ""
     if holds_run(source):
         config = TrainConfig.load(source).changed(**options)
         renderer, path, so_far = open_run(config, blend_mode, background_gate, device, None, faint_below)
     else:
-        config, path = config_of_model(source, **options)
+        config, path, missing = config_of_model(source, **options)
         renderer = open_renderer(config, path, blend_mode, device, None, background_gate, faint_below)
+    if config.scene:
+        missing = "" if is_folder(config.scene) or "scene" in options else config.scene
+    if missing:
+        print(f"note: the scene that {printable(source)} names, {printable(missing)}, is not there, so its cameras are "
+              "not known; --scene names the folder that has them", file=sys.stderr)
     cameras, orbit = places(config, renderer.model, needed="scene" in options)
     return Trained(config, path, renderer, cameras, orbit, so_far is None)
 
 
-def config_of_model(source: str, **options: Any) -> Tuple[TrainConfig, str]:
-    """Of a model that is no run: what its folder knows of its scene, with some options set, and its file.
+def config_of_model(source: str, **options: Any) -> Tuple[TrainConfig, str, str]:
+    """Of a model that is no run: what its folder knows of its scene, with some options set, its file, and a scene that
+    the folder names and that is not there.
 
     Raises TrainerError.
     """
     found = find_model(source)
     known = found.options_on(options.get("scene", ""))
-    return TrainConfig(**{"blend_mode": "alpha", **known, **options}).validate(), found.path
+    return TrainConfig(**{"blend_mode": "alpha", **known, **options}).validate(), found.path, found.missing
 
 
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:

@@ -91,8 +91,9 @@ def _config(model: str, found: Found, start: Start, given: Dict[str, Any]) -> Tr
         recorded.pop("background_gate", None)
     options = {**blend, **recorded, **given, "blend_mode": mode, "init": found.path}
     if not options.get("scene"):
-        raise ConfigError(f"{model}: neither photographs nor cameras are known; name its scene with --scene, or a "
-                          "model folder that holds cameras.json")
+        why = (f"the scene that its folder names, {found.missing}, is not there, and the folder has no cameras.json"
+               if found.missing else "neither photographs nor cameras are known")
+        raise ConfigError(f"{model}: {why}; name its scene with --scene, or a model folder that holds cameras.json")
     iterations = options.setdefault("iterations", SIMPLIFY_ITERATIONS)
     if not isinstance(iterations, int) or iterations < 4:
         raise ConfigError(f"--iterations is {iterations!r}; it must be a whole number of at least 4")

@@ -53,10 +53,11 @@ def _check_options(arguments: argparse.Namespace) -> None:
     TrainConfig(**given).validate()
 
 
-def check_cameras(source: str, scene: Optional[str]) -> None:
-    """Raises TrainerError if a model that is no run has no scene."""
+def check_cameras(source: str, scene: Optional[str], missing: str = "") -> None:
+    """Raises TrainerError if a model that is no run has no scene; missing: one that it names and that is not there."""
     if not scene:
-        raise TrainerError(f"{source} holds no cameras; name the folder that has them with --scene")
+        why = f", and the scene that it names, {missing}, is not there" if missing else ""
+        raise TrainerError(f"{source} holds no cameras{why}; name the folder that has them with --scene")
 
 
 def check_model(source: str) -> None:

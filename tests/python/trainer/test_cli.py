@@ -118,7 +118,7 @@ def test_training_says_what_it_loaded_and_what_comes_next(scene, tmp_path, capsy
     text = capsys.readouterr().out
     assert "9 training and 0 test images (no image is kept for testing), 32x24 pixels" in text
     assert "nothing was measured" in text
-    for command in (["eval", output], ["render", output, "-o", output + "_images"]):
+    for command in (["eval", output], ["render", output, "--split", "test", "-o", output + "_images"]):
         assert "has no test views; --split names others" in fails(capsys, *command)
     assert "--test-every is 1; it must be 0 or at least 2" in fails(capsys, "train", scene, "-o", output,
                                                                     "--test-every", "1")

@@ -114,11 +114,30 @@ def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_p
     capsys.readouterr()
     assert main(["render", str(folder), "-o", str(tmp_path / "no")]) == 1
     assert capsys.readouterr().err.endswith(
-        f"{folder} holds no cameras; name the folder that has them with --scene\n")
+        f"{folder} holds no cameras, and the scene that it names, nowhere, is not there; name the folder that has "
+        "them with --scene\n")
+    assert main(["simplify", str(folder), "--keep", "0.5", "-o", str(tmp_path / "no")]) == 1
+    assert "the scene that its folder names, nowhere, is not there, and the folder has no cameras.json; name its " \
+           "scene with --scene" in capsys.readouterr().err
+    assert main(["export", str(folder), "-o", str(tmp_path / "gone.html")]) == 0
+    assert f"note: the scene that {folder} names, nowhere, is not there" in capsys.readouterr().err
     shutil.rmtree(folder / "point_cloud")
     for command in (["render"], ["view"], ["export"]):
         assert main([*command, str(folder), *["-o", str(tmp_path / "no.html")][:2 * (command != ["view"])]]) == 1
         assert "no model is in it: neither config.json of `dsmoe train` nor" in capsys.readouterr().err
+
+
+def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, tiny_scene, tmp_path, capsys):
+    place = tmp_path / "model" / "point_cloud" / "iteration_7"
+    place.mkdir(parents=True)
+    shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
+    (tmp_path / "model" / "cfg_args").write_text(f"Namespace(eval=False, source_path={str(tiny_scene)!r})")
+    words = ["render", str(tmp_path / "model"), "-o", str(tmp_path / "images")]
+    assert main([*words, "--split", "test"]) == 1 and "has no test views" in capsys.readouterr().err
+    assert main(words) == 0
+    assert "eval=False in cfg_args); these are its training views" in capsys.readouterr().err
+    every = load_scene(TrainConfig(scene=tiny_scene, test_every=0), progress=False).train
+    assert {view.camera.name for view in every} <= {*os.listdir(tmp_path / "images")}
 
 
 @pytest.mark.parametrize("ending, content, words", [
