@@ -15,7 +15,7 @@ from .results.modelfile import model_path
 from .results.rendering import Renderer
 from .results.rows import write_results
 from .scenes.scene import Scene, describe_scene, load_scene, read_layout
-from .starting import Found, Start, blend_options, check_start, find_model, read_start, start_renderer
+from .starting import Found, Start, blend_options, change_of_blend, check_start, find_model, read_start, start_renderer
 from .system.device import check_device
 from .system.files import is_folder
 from .system.output_folder import make_folder, only_one
@@ -146,6 +146,8 @@ def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], No
                 "the place of photographs, unless --scene names these")
         say(f"{start.path}: {start.count:,} Gaussians of SH degree {start.gaussians.sh_degree}, blend mode "
             f"{start.blend_text}, {os.path.getsize(start.path) / 1e6:.1f} MB")
+        if change_of_blend(start, config):
+            say(change_of_blend(start, config))
         say(describe_scene(scene, layout, config))
     quality = check_start(scene, config)
     if finds_center and quality.is_centred:

@@ -29,6 +29,7 @@ from .results.modelfile import (
 )
 from .results.pictures import evenly_spaced
 from .results.rendering import Renderer, background_color
+from .results.rows import blend_name
 from .results.shown import raw_of
 from .scenes.images import View
 from .scenes.modelfolder import CAMERAS, CFG_ARGS, latest_model
@@ -197,17 +198,33 @@ def _options_of_3dgs(folder: str) -> Dict[str, Any]:
 
 
 def blend_options(start: Start, given: Dict[str, Any]) -> Dict[str, Any]:
-    """Options of a training from the model, beside given ones: its blend, and a learned gate begins with its gate."""
+    """Options of a training from the model, beside given ones: its blend, and a learned gate begins with its gate.
+
+    A gate of 0, as the paper has it, stays, unless something is given of how one is learned.
+    """
     mode = given.get("blend_mode") or start.blend_mode
     options: Dict[str, Any] = {"blend_mode": mode}
     if mode != start.blend_mode or mode not in GATED_MODES:
         return options
     options["faint_below"] = given.get("faint_below", trained_faint_below(mode, start.faint_below))
-    options["background_gate"] = given.get("background_gate", LEARNED)  # before $DSMOE_BACKGROUND_GATE
+    learns = start.background_gate != 0 or not learned_gate_of(mode).keys().isdisjoint(given)
+    # Given, so that $DSMOE_BACKGROUND_GATE does not count.
+    options["background_gate"] = given.get("background_gate", LEARNED if learns else 0.0)
     if options["background_gate"] == LEARNED and "background_gate_start" not in given:
         bound = given.get("background_gate_bound", learned_gate_of(mode)["background_gate_bound"])
         options["background_gate_start"] = max(start.background_gate, bound + LEAST_ABOVE_BOUND)
     return options
+
+
+def change_of_blend(start: Start, config: TrainConfig) -> str:
+    """What to say if the training makes another blend than the model's; else nothing."""
+    mode, gate = str(config.blend_mode), config.background_gate
+    faint = (trained_faint_below(start.blend_mode, start.faint_below), config.faint_below)
+    if mode == start.blend_mode and (mode not in GATED_MODES or gate in (start.background_gate, LEARNED)
+                                     and faint[0] == faint[1]):
+        return ""
+    return (f"note: the model is blended by {blend_name(start.blend_mode, start.background_gate, faint[0])}, and the "
+            f"result will be by {blend_name(mode, gate, faint[1])}")
 
 
 def start_renderer(start: Start, config: TrainConfig) -> Renderer:

@@ -19,7 +19,7 @@ from .results.scalars import Scalars, scalar_files
 from .scenes.layout import Layout
 from .scenes.modelfolder import CAMERAS, cameras_content
 from .scenes.scene import Scene, describe_scene, load_scene, read_layout
-from .starting import check_start
+from .starting import change_of_blend, check_start
 from .system.device import check_device
 from .system.files import is_file, write_atomically, write_json_atomically
 from .system.group import Group
@@ -302,6 +302,8 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         quality = check_start(scene, config)
         if say:
             say(f"{config.init}: blend mode {scene.start.blend_text}; {quality.text(config)}")
+            if change_of_blend(scene.start, config):
+                say(change_of_blend(scene.start, config))
     make_folder(config.output)  # a folder that cannot be made is told before images are read
     with contextlib.nullcontext(lock) if lock else only_one(config.output) as lock:
         earlier = earlier_files(config, resume, overwrite)  # again: another run may have been at work there

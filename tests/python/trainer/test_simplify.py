@@ -196,6 +196,31 @@ def test_a_model_becomes_one_of_the_authors_program(run, tmp_path, capsys, recor
         assert f"{other[0]} is " in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
+def test_a_gate_of_0_stays_and_another_blend_is_told(run, tmp_path, capsys):
+    """--blend-mode smoe learns a gate by default; one that a model records as the paper's stays 0."""
+    stored = dataclasses.replace(io.read_gaussians(ply_of(run)), blend_mode="smoe", comments=())
+    words = ["--iterations", "4", "--resolution", "30", "--quiet", "--device", "cpu"]
+
+    def trained(gate, command, name, *more):
+        ply, output = str(tmp_path / "model.ply"), str(tmp_path / name)
+        io.write_gaussians(ply, dataclasses.replace(
+            stored, background_gate=gate, comments=("faint_below 2",) if gate == 0 else ()))
+        start = ["train", run.scene, "--init", ply] if command == "train" else [
+            "simplify", ply, "--scene", run.scene, "--budget", "40"]
+        assert main([*start, *words, "-o", output, *more]) == 0
+        return load_model(model_path(output, 4), "cpu")[1], capsys.readouterr().out
+
+    for command in ("simplify", "train"):
+        blend, said = trained(0.0, command, command)
+        assert blend == ("smoe", 0, 2) and "note: the model is blended" not in said
+        blend, said = trained(0.0059, command, command + "_paper", "--paper")
+        assert blend == ("smoe", 0, 2)
+        assert ("note: the model is blended by smoe (gate 0.0059, faint below 0.25), and the result will be by smoe "
+                "(gate 0, all pairs)\n") in said
+    for more in (["--background-gate", "learned"], ["--background-gate-start", "0.1"]):
+        assert trained(0.0, "train", "_".join(more), *more)[0].background_gate > 0, "asked for"
+
+
 def test_without_photographs_a_model_is_its_own_teacher(run, tmp_path, capsys):
     (tmp_path / "model").mkdir()
     folder = model_folder(run, tmp_path / "model", "Namespace(source_path='/nowhere', eval=True, resolution=-1)")
