@@ -117,24 +117,43 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
 
     Raises TrainerError if there is neither, and if what is asked disagrees with the run.
     """
+    ply = model_path(config.output, config.iterations)
+    if is_file(ply):
+        mode, gate, _ = _agreed_with_run(config, asked_blend_mode, asked_gate, asked_faint)
+        return OpenedRun(open_renderer(config, ply, mode, device, rasterize, gate), ply, None)
+    if not is_file(os.path.join(config.output, CHECKPOINT_NAME)):
+        _agreed_with_run(config, asked_blend_mode, asked_gate, asked_faint)
+        raise TrainerError(f"{ply}: no such file; the training in {config.output} has not ended, and has no checkpoint "
+                           "yet (continue it with --resume)")
+    renderer, so_far = open_checkpoint(config, asked_blend_mode, asked_gate, device, rasterize, asked_faint)
+    print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
+          f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
+    return OpenedRun(renderer, so_far.path, so_far)
+
+
+def open_checkpoint(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
+                    rasterize: Optional[Rasterize] = None, asked_faint: Optional[float] = None
+                    ) -> Tuple[Renderer, SoFar]:
+    """A renderer for the checkpoint of the run that config is of, and what that holds. Raises as `open_run`."""
+    mode, gate, faint = _agreed_with_run(config, asked_blend_mode, asked_gate, asked_faint)
+    so_far = made_so_far(config, device)
+    gate = agreed_background_gate(so_far.path, mode, Recorded(mode, so_far.background_gate), gate)
+    return Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
+                    rasterize, background_gate=gate, faint_below=faint), so_far
+
+
+def _agreed_with_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float],
+                     asked_faint: Optional[float]) -> Tuple[str, Optional[float], Optional[float]]:
+    """The mode, the gate (None: a learned one, of which nothing is asked) and `faint_below` of a run.
+
+    Raises TrainerError if what is asked disagrees with it.
+    """
     mode = agreed_blend_mode(config.output, config.blend_mode, asked_blend_mode)
     if config.background_gate != LEARNED:
         recorded = Recorded(mode, float(config.background_gate))
         asked_gate = agreed_background_gate(config.output, mode, recorded, asked_gate)
     faint = agreed_faint_below(config.output, mode, Recorded(mode, None, config.unusual_faint), asked_faint)
-    ply = model_path(config.output, config.iterations)
-    if is_file(ply):
-        return OpenedRun(open_renderer(config, ply, mode, device, rasterize, asked_gate), ply, None)
-    if not is_file(os.path.join(config.output, CHECKPOINT_NAME)):
-        raise TrainerError(f"{ply}: no such file; the training in {config.output} has not ended, and has no checkpoint "
-                           "yet (continue it with --resume)")
-    so_far = made_so_far(config, device)
-    gate = agreed_background_gate(so_far.path, mode, Recorded(mode, so_far.background_gate), asked_gate)
-    print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
-          f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
-    renderer = Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
-                        rasterize, background_gate=gate, faint_below=faint)
-    return OpenedRun(renderer, so_far.path, so_far)
+    return mode, asked_gate, faint
 
 
 def compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:

@@ -5,15 +5,14 @@ import os
 from typing import Any, List, Optional, Tuple
 
 from ..errors import TrainerError
-from ..inspection import Trained, open_trained, places
+from ..inspection import Trained, open_checkpoint, open_trained, places
 from ..options.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from ..results.modelfile import model_path
-from ..results.rendering import Renderer, background_color
+from ..results.rendering import Renderer
 from ..scenes.cameras import Camera
 from ..scenes.orbit import Orbit
 from ..system.device import check_device
 from ..system.files import is_file
-from ..training.checkpoint import made_so_far
 
 
 class Followed:
@@ -27,7 +26,8 @@ class Followed:
     def __init__(self, source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
                  device: str = "cpu", faint_below: Optional[float] = None, **options: Any) -> None:
         """Arguments as in `open_trained`. Raises TrainerError, also if a run has no checkpoint yet."""
-        self._arguments = (source, blend_mode, background_gate, device, faint_below)
+        self._source, self._device = source, device
+        self._blend_mode, self._background_gate, self._faint_below = blend_mode, background_gate, faint_below
         self._options = options
         self._config: Optional[TrainConfig] = None  # of the run that is shown
         self._seen: Optional[Tuple[str, int]] = None  # the file that is shown, and when it was written
@@ -36,7 +36,7 @@ class Followed:
         if self._is_run:
             self.poll()
         else:
-            self._take(open_trained(*self._arguments, **options))
+            self._take(self._opened())
 
     def poll(self) -> bool:
         """Looks for a newer checkpoint, the end, or another run in the folder; returns whether there is one.
@@ -45,14 +45,14 @@ class Followed:
         """
         if not self._is_run:
             return False
-        config = TrainConfig.load(self._arguments[0]).changed(**self._options)
+        config = TrainConfig.load(self._source).changed(**self._options)
         newest = self._newest(config)
         if (config, newest) == (self._config, self._seen):
             return False
         if newest[0] == CHECKPOINT_NAME:
             self._take_checkpoint(config)
         else:
-            self._take(open_trained(*self._arguments, **self._options))
+            self._take(self._opened())
             self.progress = f"trained, {config.iterations:,} iterations"
         self._config, self._seen = config, newest
         return True
@@ -66,16 +66,17 @@ class Followed:
         raise TrainerError(f"{path}: no such file yet; the training writes it every --checkpoint-every "
                            f"{config.checkpoint_every} iterations")
 
+    def _opened(self) -> Trained:
+        return open_trained(self._source, self._blend_mode, self._background_gate, self._device, self._faint_below,
+                            **self._options)
+
     def _take(self, trained: Trained) -> None:
         self.renderer, self.cameras, self.orbit = trained.renderer, trained.cameras, trained.orbit
         self.progress = ""
 
     def _take_checkpoint(self, config: TrainConfig) -> None:
-        device = self._arguments[3]
-        so_far = made_so_far(config, device)
-        renderer = Renderer(so_far.model, str(config.blend_mode), background_color(config.white_background, device),
-                            config.antialiasing, background_gate=so_far.background_gate,
-                            faint_below=config.unusual_faint)
+        renderer, so_far = open_checkpoint(config, self._blend_mode, self._background_gate, self._device,
+                                           asked_faint=self._faint_below)
         if config != self._config:
             self.cameras, self.orbit = places(config, so_far.model, needed="scene" in self._options)
         self.renderer = renderer

@@ -119,7 +119,10 @@ def test_a_training_is_followed_to_its_end(tiny_scene, tmp_path):  # noqa: F811
         Followed(config.output)
     run.trainer.step()
     run.save_checkpoint()
-    followed = Followed(config.output)
+    for asked in ({"blend_mode": "alpha"}, {"background_gate": 0.0}, {"faint_below": 2.0}):
+        with pytest.raises(ValueError, match="not (alpha|0.0|2)"):
+            Followed(config.output, **asked)
+    followed = Followed(config.output, "smoe")
     assert followed.progress == "training, iteration 1 of 6" and not followed.poll()
     assert float(followed.renderer.background_gate) == pytest.approx(run.trainer.background_gate)
     first = followed.renderer.model.raw["means3D"].detach().clone()
