@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import os
 import re
+import shlex
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Optional, Sequence
 
@@ -63,7 +64,8 @@ class Start:
     def blend_text(self) -> str:
         """Its blend mode, and how to declare one that the file does not record."""
         hint = "" if self.gaussians.blend_mode else (
-            f" (not recorded; `dsmoe export {self.path} --blend-mode MODE -o declared.ply` records another)")
+            f" (not recorded; `dsmoe export {shlex.quote(self.path)} --paper -o declared.ply` records the blend of the "
+            "paper's program, --blend-mode smoe --background-gate X that of another one)")
         return self.blend_mode + hint
 
     def points(self) -> PointCloud:

@@ -14,7 +14,7 @@ from ..inspection import Trained, open_trained
 from ..options.choices import BAKE_ITERATIONS
 from ..options.choices import EXPORT_FORMATS as FORMATS
 from ..results.glb import BLEND, Blend, glb_bytes
-from ..results.modelfile import read_gaussians, save_model
+from ..results.modelfile import read_gaussians, recorded_of, save_model
 from ..results.pictures import evenly_spaced
 from ..results.rows import blend_name, viewer_warning
 from ..results.shown import FAINT_BELOW
@@ -51,7 +51,7 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
     if os.path.exists(path) and os.path.samefile(path, trained.path):
         raise TrainerError(f"{path} is the model itself; choose another file with -o")
     if not bake and trained.has_ended:
-        return path, _write(path, form, trained, sh_degree, overwrite)
+        return path, _write(path, form, trained, sh_degree, overwrite, blend_mode is not None)
     with tempfile.TemporaryDirectory() as folder:
         if not bake:
             return path, _write(path, form, _stored(trained, folder), sh_degree, overwrite)
@@ -86,15 +86,20 @@ def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str
     return dataclasses.replace(trained, path=ply, renderer=baked.renderer), note
 
 
-def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], overwrite: bool) -> str:
-    """Writes the file; returns a warning, which may be empty."""
+def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], overwrite: bool,
+           is_declared: bool = False) -> str:
+    """Writes the file; returns a warning, which may be empty.
+
+    is_declared: whether an option says how the model is blended, which a .ply then records.
+    """
     gaussians = read_gaussians(trained.path)
     if sh_degree is not None:
         gaussians = dataclasses.replace(gaussians, shs=gaussians.shs[:, :(sh_degree + 1) ** 2 - 1])
     renderer = trained.renderer
     warning = viewer_warning({"blend_mode": renderer.blend_mode, "background_gate": renderer.background_gate}, form)
     if form == "ply":
-        _write_ply(path, trained, gaussians, overwrite)
+        is_declared = is_declared or recorded_of(trained.path, gaussians).blend_mode is not None
+        _write_ply(path, trained, gaussians, overwrite, is_declared)
     else:
         blend = Blend(renderer.blend_mode, float(renderer.background_gate), renderer.faint_below) if warning else None
         content = {"html": lambda: html.page(gaussians, _shown(trained)).encode("utf-8"),
@@ -112,9 +117,9 @@ def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], ove
     return warning + "; with --bake alpha every viewer shows the model"
 
 
-def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: bool) -> None:
+def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: bool, is_declared: bool) -> None:
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
-    recorded: Dict[str, Any] = {"blend_mode": mode,
+    recorded: Dict[str, Any] = {"blend_mode": mode if is_declared else None,
                                 "background_gate": float(gate) if mode in GATED_MODES else None}
     known = (*recorded, FAINT_BELOW)  # also of an older name
     others = [line for line in gaussians.comments if line.split(" ")[0] not in known]

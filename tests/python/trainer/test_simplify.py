@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shlex
 import shutil
 import signal
 import struct
@@ -190,7 +191,7 @@ def test_a_model_becomes_one_of_the_authors_program(run, tmp_path, capsys, recor
     assert main(["train", run.scene, "--init", ply, "-o", str(tmp_path / "trained"), *words]) == 0
     for text in (said, capsys.readouterr().out):
         assert "blend mode alpha" in text
-        assert (f"(not recorded; `dsmoe export {ply} --blend-mode MODE -o declared" in text) == (recorded is None)
+        assert (f"(not recorded; `dsmoe export {ply} --paper -o declared" in text) == (recorded is None)
     for other in (["--blend-mode", "alpha"], ["--background-gate", "1"], ["--faint-below", "0.25"]):
         assert main([*simplifies, "-o", str(tmp_path / "no"), "--paper", *other]) == 1
         assert f"{other[0]} is " in capsys.readouterr().err and not (tmp_path / "no").exists()
@@ -473,8 +474,12 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
     assert "was its background black (now it is white)?" in fails(ply, *scene, "--white-background")
     io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]], blend_mode=None,
                                                 comments=()))
-    assert fails(ply, *scene).endswith("or is its blend mode not alpha (not recorded; `dsmoe export "
-                                       f"{ply} --blend-mode MODE -o declared.ply` records another)?\n")
+    said = fails(ply, *scene)
+    assert said.endswith("--blend-mode smoe --background-gate X that of another one)?\n")
+    words = said.partition("or is its blend mode not alpha (not recorded; `dsmoe ")[2].partition("`")[0]
+    declared = str(tmp_path / "declared.ply")
+    assert main([declared if word == "declared.ply" else word for word in shlex.split(words)]) == 0
+    assert load_model(declared, "cpu")[1] == ("smoe", 0, 2), "the command that is named works"
     (tmp_path / "model.ksplat").write_bytes(bytes(64))
     assert "model.ksplat: it is none of .ply, .splat, .spz and .glb" in fails(str(tmp_path / "model.ksplat"), *scene)
     packed = "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
