@@ -1,11 +1,9 @@
 """A trained model to start from: which file it is, what that holds, how it is blended, and what its folder knows."""
 from __future__ import annotations
 
-import ast
 import dataclasses
 import functools
 import os
-import re
 import shlex
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Optional, Sequence
@@ -24,6 +22,7 @@ from .results.evaluation import evaluate
 from .results.modelfile import (
     agreed_background_gate,
     agreed_blend_mode,
+    check_folder,
     model_path,
     read_gaussians,
     recorded_of,
@@ -33,7 +32,7 @@ from .results.rendering import Renderer, background_color
 from .results.rows import blend_name
 from .results.shown import raw_of
 from .scenes.images import View
-from .scenes.modelfolder import CAMERAS, CFG_ARGS, latest_model
+from .scenes.modelfolder import CAMERAS, cfg_args_of, latest_model
 from .scenes.pointcloud import SH_C0, PointCloud
 from .system.files import is_file, is_folder
 
@@ -136,6 +135,9 @@ def _read_start(path: str, *_: int) -> Start:
         what = f"{bad:,} of its {count:,} Gaussians have a number that is NaN or infinite" if bad else "it is empty"
         raise TrainerError(f"{path}: {what}; `dsmoe export MODEL -o clean.glb` leaves such Gaussians out")
     recorded = recorded_of(path, gaussians)
+    gaussians = dataclasses.replace(gaussians, blend_mode=recorded.blend_mode)  # or of its folder
+    if recorded.blend_mode is None:
+        check_folder(path)
     mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")
     return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None), recorded.faint_below)
 
@@ -176,19 +178,12 @@ def _found_run(folder: str) -> Found:
 
 
 def _options_of_3dgs(folder: str) -> Dict[str, Any]:
-    """What cfg_args, a Namespace as text, says of the training. Where it had principal points is seen later."""
+    """What cfg_args says of the training but the blend, which `recorded_of` reads.
+
+    Where it had principal points is seen later.
+    """
     options: Dict[str, Any] = {}
-    path = os.path.join(folder, CFG_ARGS)
-    if not is_file(path):
-        return options
-    with open(path, encoding="utf-8", errors="replace") as file:
-        text = file.read()
-    known: Dict[str, Any] = {}
-    for name, value in re.findall(r"[(, ](\w+)=('[^']*'|\"[^\"]*\"|[^,()]+)", text):
-        try:
-            known[name] = ast.literal_eval(value)
-        except (ValueError, SyntaxError):
-            continue  # an object of the trainer's own
+    known = cfg_args_of(folder)
     if isinstance(known.get("source_path"), str):
         options["scene"] = known["source_path"]
     for name, kind in (("images", str), ("resolution", int), ("white_background", bool), ("antialiasing", bool)):

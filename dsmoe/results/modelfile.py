@@ -2,13 +2,17 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
-from typing import NamedTuple, Optional, Tuple
+from typing import Any, NamedTuple, Optional, Tuple
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import (
     BLEND_MODES,
     GATED_MODES,
+    LEARNED,
+    PAPER,
+    PAPER_PROGRAM,
     resolve_background_gate,
     resolve_faint_below,
     trained_faint_below,
@@ -16,6 +20,7 @@ from diff_smoe_rasterization.settings import (
 
 from ..errors import TrainerError, printable
 from ..model import GaussianModel, finite_rows
+from ..scenes.modelfolder import CFG_ARGS, cfg_args_of
 from ..system.files import new_file
 from .glb import glb_gaussians
 from .shown import FAINT_BELOW, raw_of
@@ -93,14 +98,60 @@ def read_gaussians(path: str) -> io.Gaussians:
 
 
 def recorded_of(path: str, stored: io.Gaussians) -> Recorded:
-    """What a file says of its blend. Raises TrainerError if its comment on `faint_below` is wrong."""
+    """What a file says of its blend, else the cfg_args of the 3DGS model folder that it lies in.
+
+    Raises TrainerError if its comment on `faint_below` is wrong.
+    """
     said = [line.partition(" ")[2] for line in stored.comments if line.startswith(FAINT_BELOW + " ")]
     try:
         faint = resolve_faint_below("smoe", float(said[-1])) if said else None
     except ValueError as error:
         raise TrainerError(f"{path}: its comment records {FAINT_BELOW} {said[-1]!r}; it must be a number of at least 0"
                            ) from error
-    return Recorded(stored.blend_mode, stored.background_gate, faint)
+    recorded = Recorded(stored.blend_mode, stored.background_gate, faint)
+    return recorded if any(said is not None for said in recorded) else _recorded_of_folder(path)
+
+
+def _recorded_of_folder(path: str) -> Recorded:
+    """What the cfg_args of a 3DGS model folder says of its file; nothing if the gate was learned."""
+    mode, gate, faint = _blend_of_folder(path)
+    return Recorded(None, None) if gate == LEARNED else Recorded(mode, gate, faint)
+
+
+def _blend_of_folder(path: str) -> Tuple[Optional[str], Any, Optional[float]]:
+    """The blend in the cfg_args of the 3DGS model folder that a file lies in, as `dsmoe patch` has it there.
+
+    It is mode, gate, which may be LEARNED, and `faint_below`. Raises TrainerError.
+    """
+    place = os.path.dirname(os.path.abspath(path))
+    if os.path.basename(os.path.dirname(place)) != FOLDER:
+        return None, None, None
+    folder = os.path.dirname(os.path.dirname(place))
+    known = cfg_args_of(folder)
+    mode, gate, faint = (known.get(name) for name in PAPER_PROGRAM)
+    if mode == PAPER:
+        mode, gate, faint = PAPER_PROGRAM.values()
+    if mode not in BLEND_MODES:
+        return None, None, None
+    if mode not in GATED_MODES:
+        return mode, None, None
+    if gate == "":
+        gate = LEARNED if mode == "smoe" else None  # the defaults of a training there
+    try:
+        return (mode, gate if gate in (None, LEARNED) else float(resolve_background_gate(mode, float(gate))),
+                None if faint is None else resolve_faint_below(mode, faint))
+    except (TypeError, ValueError) as error:
+        raise TrainerError(f"{os.path.join(folder, CFG_ARGS)}: of the blend {mode} it records the background gate "
+                           f"{gate!r} and faint_below {faint!r}; both must be numbers of at least 0") from error
+
+
+def check_folder(path: str) -> None:
+    """Raises TrainerError if a file that records no blend lies in a 3DGS model folder whose gate was learned."""
+    mode, gate, _ = _blend_of_folder(path)
+    if gate == LEARNED:
+        raise TrainerError(f"{path} records no blend, and its folder's cfg_args says {mode} with a learned background "
+                           f"gate, but not its value; declare it: `dsmoe export {shlex.quote(path)} --blend-mode "
+                           f"{mode} --background-gate X -o declared.ply`")
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
@@ -112,6 +163,7 @@ def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) 
         raise TrainerError(f"{path}: its comment records the blend mode {recorded!r}; this version knows "
                            f"{', '.join(BLEND_MODES)}")
     if recorded is None and asked is None:
+        check_folder(path)
         print(f"note: {printable(path)} records no blend mode, so it is alpha, as other 3DGS programs blend; "
               "--blend-mode says otherwise", file=sys.stderr)
         return "alpha"

@@ -1,6 +1,7 @@
 """The folder of a trained 3DGS model as a scene: the cameras of cameras.json, and what the model shows there."""
 from __future__ import annotations
 
+import ast
 import collections
 import dataclasses
 import glob
@@ -34,6 +35,22 @@ def latest_model(folder: str) -> str:
         if number and is_file(path):
             found.append((int(number.group(1)), path))
     return max(found)[1] if found else ""
+
+
+def cfg_args_of(folder: str) -> Dict[str, Any]:
+    """The plain values in a model folder's cfg_args, a Namespace as text; none if there is no such file."""
+    path = os.path.join(folder, CFG_ARGS)
+    known: Dict[str, Any] = {}
+    if not is_file(path):
+        return known
+    with open(path, encoding="utf-8", errors="replace") as file:
+        text = file.read()
+    for name, value in re.findall(r"[(, ](\w+)=('[^']*'|\"[^\"]*\"|[^,()]+)", text):
+        try:
+            known[name] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            continue  # an object of the trainer's own
+    return known
 
 
 def read_model_layout(folder: str, config: TrainConfig) -> Layout:

@@ -16,6 +16,7 @@ from dsmoe.options.config import TrainConfig
 from dsmoe.results.glb import glb_bytes
 from dsmoe.results.modelfile import load_model
 from dsmoe.scenes.scene import load_scene
+from dsmoe.starting import read_start
 from dsmoe.view.following import Followed
 
 ENDINGS = ("ply", "splat", "spz", "glb")
@@ -139,6 +140,42 @@ def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, ti
     assert "eval=False in cfg_args); these are its training views" in capsys.readouterr().err
     every = load_scene(TrainConfig(scene=tiny_scene, test_every=0), progress=False).train
     assert {view.camera.name for view in every} <= {*os.listdir(tmp_path / "images")}
+
+
+@pytest.mark.parametrize("said, blend", [
+    ("blend_mode='paper', background_gate=''", ("smoe", 0, 2)),
+    ("blend_mode='smoe', background_gate=0.25, faint_below=None", ("smoe", 0.25, None)),
+    ("blend_mode='smoe_eq7', background_gate=''", ("smoe_eq7", 0, None)), ("blend_mode='other'", ("alpha", 1, None))])
+def test_cfg_args_says_how_a_file_without_a_record_is_blended(model, tiny_scene, tmp_path, said, blend):
+    """None: as usual. What the file itself records counts more."""
+    place, copy = tmp_path / "model" / "point_cloud" / "iteration_7", str(tmp_path / "copy.ply")
+    place.mkdir(parents=True)
+    shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
+    (tmp_path / "model" / "cfg_args").write_text(f"Namespace({said}, source_path={str(tiny_scene)!r})")
+    opened = open_trained(str(tmp_path / "model")).renderer
+    assert (opened.blend_mode, opened.background_gate, opened.faint_below) == blend
+    start = read_start(str(place / "point_cloud.ply"))
+    assert (start.blend_mode, start.background_gate, start.faint_below) == blend
+    assert main(["export", str(tmp_path / "model"), "-o", copy]) == 0
+    assert io.read_gaussians(copy).blend_mode == (None if "other" in said else blend[0])
+    io.write_gaussians(str(place / "point_cloud.ply"), dataclasses.replace(model, blend_mode="smoe_std"))
+    assert open_trained(str(tmp_path / "model")).renderer.blend_mode == "smoe_std"
+
+
+def test_a_learned_gate_that_no_file_records_is_asked_for(model, tiny_scene, tmp_path, capsys):
+    place, declared = tmp_path / "model" / "point_cloud" / "iteration_7", str(tmp_path / "declared.ply")
+    place.mkdir(parents=True)
+    ply = shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
+    text = f"Namespace(blend_mode='smoe', background_gate='learned', source_path={str(tiny_scene)!r})"
+    (tmp_path / "model" / "cfg_args").write_text(text)
+    for words in (["render", "-o", str(tmp_path / "no")], ["simplify", "--keep", "1", "-o", str(tmp_path / "no")]):
+        assert main([words[0], str(tmp_path / "model"), *words[1:]]) == 1
+        assert "with a learned background gate, but not its value; declare it" in capsys.readouterr().err
+    assert main(["export", str(ply), "-o", declared, "--blend-mode", "smoe", "--background-gate", "0.125"]) == 0
+    assert load_model(declared, "cpu")[1] == ("smoe", 0.125, None)
+    (tmp_path / "model" / "cfg_args").write_text(text.replace("'learned'", "'much'"))
+    assert main(["render", str(tmp_path / "model"), "-o", str(tmp_path / "no")]) == 1
+    assert "cfg_args: of the blend smoe it records the background gate 'much'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("ending, content, words", [
