@@ -585,9 +585,12 @@ def test_a_model_of_the_papers_authors_is_rendered_by_smoe_with_the_gate_0(train
         return np.asarray(Image.open(os.path.join(folder, "view_000.png")))
 
     assert not np.array_equal(rendered("smoe"), rendered("smoe_eq7")), "the two rules show different images"
-    assert main(["render", str(ply), "--scene", scene, "--paper", "-o", str(tmp_path / "program")]) == 0
+    paper = ["render", str(ply), "--scene", scene, "--paper", "-o"]
+    assert main([*paper, str(tmp_path / "program")]) == 0
     program = np.asarray(Image.open(tmp_path / "program" / "view_000.png"))
     assert not np.array_equal(program, rendered("smoe")), "all pairs count in it"
+    assert main([*paper, str(tmp_path / "smoe"), "--split", "train"]) == 0
+    assert not (tmp_path / "smoe" / "view_000.png").exists(), "of another faint_below"
     nowhere = ["-o", str(tmp_path / "no")]
     assert "authors' program" in fails(capsys, "render", str(ply), "--scene", scene, "--blend-mode", "smoe", *nowhere)
     assert "out-temp holds no cameras; name" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)

@@ -339,8 +339,10 @@ def test_a_panorama_has_no_seam(tmp_path, mode):
         with torch.no_grad():
             trainer.model.raw["scales"] -= 1  # none is wider than the image
         losses = [float(trainer.step().loss) for _ in range(EVERY - 1)]  # a pinhole would look another way
-        color = trainer.renderer(trainer.scene.train[0].camera).color.detach()
-        runs.append((losses, trainer.whole_model().raw["means3D"], color.roll(-32 * turned, 2)))
+        rendering = trainer.renderer(trainer.scene.train[0].camera)
+        color, look = rendering.color.detach(), next(iter(trainer.passes.look(trainer.scene.train[:1])))
+        assert len(rendering.radii) == len(look.costs) == trainer.num_gaussians
+        runs.append((losses, trainer.whole_model().raw["means3D"], color.roll(-32 * turned, 2), *look))
         cut = trainer.renderer.with_splats(trainer.scene.train[0].camera)[0].color
         assert not turned or (cut - color).abs().max() > 0.05, "the Gaussians are at the seam"
     for straight, turned in zip(*runs):
