@@ -514,6 +514,7 @@ def sentences() -> Dict[str, List[str]]:
     return {
         "README.md": [
             f"Compact-3DGS gains {compact_gains} dB at 0.005", f"HAC changes by {hac_gains} dB",
+            f"Taming changes by {taming_all} dB",
             newest_span, f"keep their quality with {dense_plugged[1]} Gaussians",
             few, equal, f"{slower_fps['learned']} % slower", f"loses {span(authors, 1)} dB",
             f"bonsai loses {span(ablated, 1)} dB", f"Lego loses {-lego[-1]:.2f} dB",

@@ -12,7 +12,7 @@ from .arguments import build_parser, completion_script
 from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
 from .options.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from .options.config_arguments import config_from_arguments, given_options, take_paper
-from .options.early import check_cameras, check_early
+from .options.early import check_early
 from .options.presets import STRATEGY
 from .patches import PatchError
 from .system.interrupt import PromptInterrupt, exit_status
@@ -359,7 +359,9 @@ def _render(arguments: argparse.Namespace) -> None:
         config, ply = TrainConfig.of_run(arguments.model, "--scene", **overrides), None
     else:
         config, ply, missing = config_of_model(arguments.model, **overrides)
-        check_cameras(arguments.model, config.scene, missing)
+        if not config.scene:
+            why = f", and the scene that it names, {missing}, is not there" if missing else ""
+            raise TrainerError(f"{arguments.model} holds no cameras{why}; name the folder that has them with --scene")
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
                           background_gate=arguments.background_gate, outputs=outputs,
                           overwrite=arguments.overwrite, faint_below=arguments.faint_below)

@@ -281,14 +281,14 @@ class TrainConfig:
         notes = []
         if self.iterations <= self.densify_from_iter < self.densify_until_iter:
             notes.append(f"--iterations {self.iterations} adds no Gaussians: that begins after step "
-                         f"{self.densify_from_iter}; --scale-recipe squeezes the recipe into so few")
+                         f"{self.densify_from_iter}; --scale-recipe squeezes the schedule into so few")
         if self.strategy == "importance" and 4 * self.densify_until_iter >= 3 * self.iterations:
             notes.append(f"--densify-until-iter {self.densify_until_iter} leaves no iterations to settle; below three "
                          "quarters of --iterations it does; left out it is half of them")
         return notes
 
     def shortened(self) -> TrainConfig:
-        """The same recipe squeezed into `iterations` steps: each milestone keeps its share of the 30,000 of 3DGS.
+        """The same schedule squeezed into `iterations` steps: each milestone keeps its share of the 30,000 of 3DGS.
 
         The densification interval stays, as far as ten densifications fit. What is not at its default is kept.
         """

@@ -3,9 +3,8 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import Optional
 
-from ..errors import SceneError, TrainerError
+from ..errors import ConfigError, SceneError, TrainerError
 from ..system.files import check_output, is_file, is_folder
 from .choices import MODEL
 from .config import TrainConfig, holds_run
@@ -27,13 +26,11 @@ def check_early(arguments: argparse.Namespace) -> None:
     elif command == "simplify":
         check_model(arguments.model)
     elif command == "eval":
-        TrainConfig.load(arguments.output)
+        _check_run(arguments.output)
     elif command in ("render", "export", "view"):
         check_model(arguments.model)
         if holds_run(arguments.model):
             TrainConfig.load(arguments.model)
-        elif command == "render" and not arguments.orbit and is_file(arguments.model):
-            check_cameras(arguments.model, scene)
         if command == "render" and arguments.orbit:
             check_orbit(arguments.frames, arguments.fps)
         if command == "export" and arguments.output:
@@ -53,11 +50,12 @@ def _check_options(arguments: argparse.Namespace) -> None:
     TrainConfig(**given).validate()
 
 
-def check_cameras(source: str, scene: Optional[str], missing: str = "") -> None:
-    """Raises TrainerError if a model that is no run has no scene; missing: one that it names and that is not there."""
-    if not scene:
-        why = f", and the scene that it names, {missing}, is not there" if missing else ""
-        raise TrainerError(f"{source} holds no cameras{why}; name the folder that has them with --scene")
+def _check_run(folder: str) -> None:
+    """Raises ConfigError if it is not the output folder of a training; the error says what renders another model."""
+    if is_file(folder) or is_folder(os.path.join(folder, "point_cloud")) and not holds_run(folder):
+        raise ConfigError(f"{folder} is not the output folder of `dsmoe train`, whose scene and options eval takes; "
+                          f"`dsmoe render {folder} --scene SCENE -o IMAGES` renders such a model")
+    TrainConfig.load(folder)
 
 
 def check_model(source: str) -> None:

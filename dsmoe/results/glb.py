@@ -66,11 +66,17 @@ def glb_bytes(gaussians: Gaussians, blend: Optional[Blend]) -> bytes:
 
 def glb_gaussians(content: bytes) -> Gaussians:
     """What a file holds: the first primitive of Gaussians, in float32. Raises ValueError if there is none."""
+    header = struct.Struct("<4s2II4s")
+    if len(content) < header.size:
+        raise ValueError(f"not a .glb of Gaussians: it has {len(content)} bytes, of {header.size} at least")
+    magic, _, _, length, kind = header.unpack_from(content)
+    if (magic, kind) != (b"glTF", b"JSON"):
+        raise ValueError("it is not a binary glTF")
+    if len(content) < header.size + length:
+        raise ValueError(f"not a .glb of Gaussians: it has {len(content)} bytes, but its JSON ends at byte "
+                         f"{header.size + length} (truncated file?)")
     try:
-        magic, _, _, length, kind = struct.unpack_from("<4s2II4s", content)
-        if (magic, kind) != (b"glTF", b"JSON"):
-            raise ValueError("it is not a binary glTF")
-        document, binary = json.loads(content[20:20 + length]), content[28 + length:]
+        document, binary = _json(content[20:20 + length]), content[28 + length:]
         primitives = [primitive for mesh in document["meshes"] for primitive in mesh["primitives"]
                       if SPLATTING in primitive.get("extensions", {})]
         if not primitives:
@@ -94,9 +100,18 @@ def glb_gaussians(content: bytes) -> Gaussians:
             rotations=arrays[f"{SPLATTING}:ROTATION"][:, [3, 0, 1, 2]],
             blend_mode=blend.get("blendMode", "alpha"), background_gate=blend.get("backgroundGate"),
             comments=(f"{FAINT_BELOW} {blend['faintBelow']}",) if "faintBelow" in blend else ())
-    except (KeyError, IndexError, TypeError, AttributeError, struct.error, RecursionError) as error:
+    except KeyError as error:
+        raise ValueError(f"not a .glb of Gaussians: it has no {error}") from error
+    except (IndexError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"not a .glb of Gaussians ({error})") from error
     return y_up(gaussians)
+
+
+def _json(text: bytes) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"not a .glb of Gaussians: its JSON is not valid ({error})") from error
 
 
 def _read(document: Dict[str, Any], binary: bytes, index: int) -> np.ndarray:

@@ -64,7 +64,7 @@ def spz_gaussians(content: bytes) -> Gaussians:
         try:
             data = gsply.read_spz(path)
         except Exception as error:  # gsply's own, and of zlib
-            raise ValueError(f"gsply cannot read it: {error}") from error
+            raise ValueError("gsply cannot read it: " + str(error).replace(f": {path}", "")) from error
     count = len(data.means)
     arrays = {"means3D": data.means, "dc": data.sh0.reshape(count, 1, 3),
               "shs": np.zeros((count, 0, 3)) if data.shN is None else data.shN.reshape(count, -1, 3),

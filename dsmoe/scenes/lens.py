@@ -27,7 +27,8 @@ MODELS: Dict[str, Tuple[int, bool, Tuple[str, ...]]] = {
     "THIN_PRISM_FISHEYE": (2, True, ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")),
     "EQUIRECTANGULAR": (0, False, ()),
 }
-THIN_PRISM, AROUND = "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"  # which OpenCV does not undistort
+THIN_PRISM, AROUND = "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"
+NOT_UNDISTORTED = frozenset((THIN_PRISM, AROUND))  # by OpenCV
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # the order of OpenCV's coefficients
 FISHEYE = ("k1", "k2", "k3", "k4")
 MAX_ASPECT_ERROR = 0.02  # of an image of all directions

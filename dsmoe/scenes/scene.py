@@ -24,6 +24,7 @@ from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import MAX_WIDTH, View, fitted_camera, load_views, shown_by_lens, size_of_image
 from .layout import Layout, PosedImage, check_lenses, with_lenses, with_masks, without_missing
+from .lens import NOT_UNDISTORTED
 from .modelfolder import CAMERAS, read_model_layout, rendered_views
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
@@ -131,10 +132,11 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     if scene.start:
         points = f"{count:,} Gaussians of a model"
     lines = [layout.warning, scene.note]
-    models = sorted({view.camera.lens.camera_model for view in views if view.camera.lens})
+    models = sorted({view.camera.lens.model for view in views if view.camera.lens})
     if models:
         chosen = config.lenses == "auto" and layout.kind != "model"  # whose renderings keep any lens
-        why = ", since undistortion would cut off much of them" if chosen else ""
+        cannot = ", since OpenCV cannot undistort them" if set(models) <= NOT_UNDISTORTED else ""
+        why = (cannot or ", since undistortion would cut off much of them") if chosen else ""
         masked = any(shown_by_lens(view.camera) is not None for view in views)
         lines.append(f"images of camera model {', '.join(models)} stay as they are{why}; Gaussians are projected "
                      f"through it, in a training each {EVERY}th time by a pinhole camera"

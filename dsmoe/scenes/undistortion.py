@@ -29,7 +29,7 @@ from .images import (
     unreadable,
 )
 from .layout import Layout, PosedImage, each_lens
-from .lens import AROUND, THIN_PRISM, Lens
+from .lens import NOT_UNDISTORTED, Lens
 
 CACHE_VARIABLE = "DSMOE_CACHE"  # a folder for undistorted images, in place of the scene's own
 CACHE_NAME = ".dsmoe_cache"  # of a scene's folder
@@ -71,7 +71,7 @@ def cut_off(camera: Camera, lens: Lens) -> float:
 
     camera: without the lens.
     """
-    if lens.model in (THIN_PRISM, AROUND):  # OpenCV does not undistort it
+    if lens.model in NOT_UNDISTORTED:
         return 1.0
     steps = (np.arange(GRID) + 0.5) / GRID
     x, y = np.meshgrid((steps * camera.width - camera.cx) / camera.fx, (steps * camera.height - camera.cy) / camera.fy)
@@ -103,7 +103,7 @@ def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str
     if not bent:
         return layout, ""
     models = ", ".join(sorted({image.lens.model for image in bent}))
-    unknown = sorted({image.lens.model for image in bent} & {THIN_PRISM, AROUND})
+    unknown = sorted({image.lens.model for image in bent} & NOT_UNDISTORTED)
     if unknown:
         raise SceneError(f"scene {scene}: OpenCV does not remove the distortion of camera model {unknown[0]}; "
                          "--lenses native trains through it")

@@ -28,6 +28,7 @@ from diff_smoe_rasterization import (
     rasterize,
     settings_from_camera,
 )
+from diff_smoe_rasterization.footprints import Footprints
 from diff_smoe_rasterization.settings import BLEND_MODES, CAMERA_MODELS, OUTPUTS
 from dsmoe.distributed.rows import ViewRows
 
@@ -173,6 +174,17 @@ def test_footprints_across_the_seam_are_drawn_on_both_sides(mode):
         images.append([blend_footprints(each, settings).color for each in (whole, prints)])
     assert_close(images[1][0].roll(width // 2, 2), images[0][0], FLOAT64_TOLERANCE, "color")
     assert (images[1][1].roll(width // 2, 2) - images[0][1]).abs().max() > 0.05, "a seam without the copies"
+
+
+def test_copies_are_those_of_which_a_pixel_beyond_the_seam_can_see_something():
+    """Sigma is 3 pixels, so the radius 9. The faintest tail is 2^-35: of opacity 0.5 it is 6.86 sigmas away."""
+    rows = [(25, 1e-10, 100.0), (31, 1e-10, 100.0), (8, 1e-10, 1.0), (9.5, 1e-10, 1.0), (20, 0.5, 1.0), (21, 0.5, 1.0)]
+    gates = torch.tensor([[column, 5, 1 / 9, 0, 1 / 9, opacity, reach, 1] for column, opacity, reach in rows]).double()
+    ones = torch.ones(len(rows), 1).double()
+    for side, columns in enumerate((gates[:, 0], 999 - gates[:, 0])):
+        mirrored = torch.cat([columns[:, None], gates[:, 1:]], 1)
+        copied = Footprints(mirrored, ones, torch.full((len(rows),), 9, dtype=torch.int32)).copied(1000)
+        assert copied[side].tolist() == [0, 2, 4] and not len(copied[1 - side])
 
 
 def test_a_batch_takes_views_of_different_models():

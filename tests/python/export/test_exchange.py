@@ -5,6 +5,7 @@ import dataclasses
 import json
 import struct
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -269,6 +270,29 @@ def test_an_spz_without_gsply_is_refused_with_the_command_that_helps(export, tmp
     io.write_gaussians(model, cloud())
     assert main(["export", model, "-o", str(path)]) == 1
     assert "pip install gsply; it needs Python 3.10" in capsys.readouterr().err and not path.exists()
+
+
+@pytest.mark.parametrize("ending, content, words", [
+    ("glb", b"", "not a .glb of Gaussians: it has 0 bytes, of 20 at least"),
+    ("glb", b"glTF" + bytes(6), "not a .glb of Gaussians: it has 10 bytes, of 20 at least"),
+    ("glb", bytes(20), "it is not a binary glTF"),
+    ("glb", struct.pack("<4s2II4s", b"glTF", 2, 30, 10, b"JSON") + b"{}",
+     "not a .glb of Gaussians: it has 22 bytes, but its JSON ends at byte 30 (truncated file?)"),
+    ("glb", struct.pack("<4s2II4s", b"glTF", 2, 22, 2, b"JSON") + b"{}", "not a .glb of Gaussians: it has no 'meshes'"),
+    ("glb", struct.pack("<4s2II4s", b"glTF", 2, 22, 2, b"JSON") + b"{{",
+     "not a .glb of Gaussians: its JSON is not valid (Expecting property name"),
+    ("spz", b"", "gsply cannot read it: too short\n")])
+def test_what_cannot_be_read_is_named_in_a_line(tmp_path, monkeypatch, capsys, ending, content, words):
+    """With its own path, not that of the copy that gsply reads, whose errors end with it."""
+    def read_spz(path):
+        raise ValueError(f"too short: {path}")
+
+    monkeypatch.setitem(sys.modules, "gsply", SimpleNamespace(read_spz=read_spz))
+    path = tmp_path / f"model.{ending}"
+    path.write_bytes(content)
+    assert main(["export", str(path), "-o", str(tmp_path / "copy.ply")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"dsmoe export: error: {path}: {words}") and said.count("\n") == 1
 
 
 def test_a_glb_of_more_than_4_GiB_is_refused(monkeypatch):

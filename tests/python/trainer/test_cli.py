@@ -193,6 +193,7 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
     """Which takes seconds. A command without an action lists what there is."""
     ply = tmp_path / "a.ply"
     ply.write_text("")
+    (tmp_path / "model" / "point_cloud").mkdir(parents=True)
     said = {  # what is typed, and what is said of it
         "train|nowhere|-o|o": "scene nowhere: no such folder", f"train|{ply}|-o|o": "is a file; a scene is a folder",
         f"train|{scene}|-o|o|--iterations|0": "--iterations is 0; it must be at least 1",
@@ -201,7 +202,8 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         "simplify|nowhere|-o|o|--budget|9": "nowhere: no such file or folder; name a .ply, .splat",
         "scene|nowhere|-o|o": "no such folder of photographs", "eval|nowhere": "nowhere: no such folder",
         f"eval|{tmp_path}": "holds no config.json", "render|nowhere|-o|o": "no such file or folder",
-        f"render|{ply}|-o|o": f"{ply} holds no cameras", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
+        f"eval|{ply}": f"`dsmoe render {ply} --scene SCENE -o IMAGES` renders",
+        "eval|model": "`dsmoe render model --scene", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
         f"render|{ply}|-o|o|--scene|nowhere": "scene nowhere: no such folder", "view|nowhere": "no such file or folder",
         "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it"}
     listed = {"": "measure a trained run again", "patch": "take the patch out of every file",
@@ -583,9 +585,12 @@ def test_a_model_of_the_papers_authors_is_rendered_by_smoe_with_the_gate_0(train
         return np.asarray(Image.open(os.path.join(folder, "view_000.png")))
 
     assert not np.array_equal(rendered("smoe"), rendered("smoe_eq7")), "the two rules show different images"
-    assert main(["render", str(ply), "--scene", scene, "--paper", "-o", str(tmp_path / "program")]) == 0
+    paper = ["render", str(ply), "--scene", scene, "--paper", "-o"]
+    assert main([*paper, str(tmp_path / "program")]) == 0
     program = np.asarray(Image.open(tmp_path / "program" / "view_000.png"))
     assert not np.array_equal(program, rendered("smoe")), "all pairs count in it"
+    assert main([*paper, str(tmp_path / "smoe"), "--split", "train"]) == 0
+    assert not (tmp_path / "smoe" / "view_000.png").exists(), "of another faint_below"
     nowhere = ["-o", str(tmp_path / "no")]
     assert "authors' program" in fails(capsys, "render", str(ply), "--scene", scene, "--blend-mode", "smoe", *nowhere)
     assert "out-temp holds no cameras; name" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)

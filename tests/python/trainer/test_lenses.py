@@ -163,7 +163,7 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
     output = str(tmp_path / "out")
     assert main(["train", folder, "-o", output, "--iterations", "200", "--blend-mode", "smoe", "--background-gate", "0",
                  "--device", "cpu", "--test-every", "4"]) == 0
-    assert "camera model fisheye stay as they are, since undistortion would cut off much" in capsys.readouterr().out
+    assert "model OPENCV_FISHEYE stay as they are, since undistortion would cut off much" in capsys.readouterr().out
     with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
         row = json.load(file)
     row = row[0] if isinstance(row, list) else row
@@ -279,7 +279,7 @@ def test_renderings_through_a_lens_are_masked(tmp_path, capsys):
     output = str(tmp_path / "out")
     assert main(["simplify", folder, "--keep", "0.5", "-o", output, "--iterations", "4", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
-    assert "camera model opencv stay as they are; Gaussians" in text and "pixels beyond the lens are masked" in text
+    assert "model FULL_OPENCV stay as they are; Gaussians" in text and "pixels beyond the lens are masked" in text
     with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
         protocol = json.load(file)[0]["protocol"]
     assert protocol["scene_kind"] == "model" and protocol["masks"]
@@ -316,8 +316,13 @@ def test_wrong_lenses_of_cameras_json_are_named(tmp_path, fields, words):
 def test_panoramas_of_colmap(tmp_path):
     """Its model of all directions; the parameters are the image's size. Another size of the images is no matter."""
     folder = write_scene(tmp_path, "EQUIRECTANGULAR", [128, 64], Image.new("RGB", (64, 32)), size=(128, 64))
-    settings = load(folder, "auto").train[0].camera.settings(torch.zeros(3), 0, "smoe")
+    config = TrainConfig(scene=folder, lenses="auto", test_every=0, device="cpu")
+    layout = read_layout(config)
+    scene = load_scene(config, progress=False, layout=layout)
+    settings = scene.train[0].camera.settings(torch.zeros(3), 0, "smoe")
     assert settings.camera_model == "equirectangular" and (settings.image_width, settings.image_height) == (64, 32)
+    said = describe_scene(scene, layout, config)
+    assert "EQUIRECTANGULAR stay as they are, since OpenCV cannot undistort them; Gaussians" in said
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
@@ -334,8 +339,10 @@ def test_a_panorama_has_no_seam(tmp_path, mode):
         with torch.no_grad():
             trainer.model.raw["scales"] -= 1  # none is wider than the image
         losses = [float(trainer.step().loss) for _ in range(EVERY - 1)]  # a pinhole would look another way
-        color = trainer.renderer(trainer.scene.train[0].camera).color.detach()
-        runs.append((losses, trainer.whole_model().raw["means3D"], color.roll(-32 * turned, 2)))
+        rendering = trainer.renderer(trainer.scene.train[0].camera)
+        color, look = rendering.color.detach(), next(iter(trainer.passes.look(trainer.scene.train[:1])))
+        assert len(rendering.radii) == len(look.costs) == trainer.num_gaussians
+        runs.append((losses, trainer.whole_model().raw["means3D"], color.roll(-32 * turned, 2), *look))
         cut = trainer.renderer.with_splats(trainer.scene.train[0].camera)[0].color
         assert not turned or (cut - color).abs().max() > 0.05, "the Gaussians are at the seam"
     for straight, turned in zip(*runs):
