@@ -214,7 +214,8 @@ def _train_in(group: Group, config: TrainConfig, layout: Optional[Layout], argum
               "densification of 3DGS")
         if config.iterations < TrainConfig.iterations and not (
                 hasattr(arguments, "iterations") or arguments.fast or arguments.best):
-            print("note: fewer iterations, as the scene has few photographs; --iterations N sets another number")
+            print("note: fewer iterations, as the scene has few photographs; --iterations N sets another number, and "
+                  f"with --budget it is {TrainConfig.iterations}")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,

@@ -64,7 +64,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
         print(line)
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
-        raise TrainerError(f"scene {config.scene} has no {split} views; --split names others")
+        raise TrainerError(f"scene {config.scene} has no {split or 'test'} views; --split names others")
     masked = bool(earlier) and "masks" in earlier[0].get("protocol", {})
     if masked != any(view.mask is not None for view in views) and earlier:
         raise TrainerError(f"{config.scene} has {'no masks' if masked else 'masks'}, but the run was measured "
@@ -199,11 +199,11 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: O
     cameras = load_cameras(config, split or "test")
     if not cameras and not split:
         cameras = load_cameras(config, "train")
-        why = " (test_every is 0, as with eval=False in cfg_args)" if config.test_every == 0 else ""
+        why = " (no image is held out: --test-every 0, in cfg_args eval=False)" if config.test_every == 0 else ""
         print(f"note: scene {printable(config.scene)} has no test views{why}; these are its training views",
               file=sys.stderr)
     if not cameras:
-        raise TrainerError(f"scene {config.scene} has no {split} views; --split names others")
+        raise TrainerError(f"scene {config.scene} has no {split or 'test'} views; --split names others")
     return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs, overwrite)
 
 

@@ -14,7 +14,7 @@ namespace dsmoe::tools {
 namespace {
 
 // A path whole, however long: its end tells which file it is.
-std::string quoted(const std::string& path) { return '"' + path + '"'; }
+std::string quoted(const std::string& path) { return io::printable(path, path.size()); }
 
 }  // namespace
 

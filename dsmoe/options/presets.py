@@ -65,7 +65,7 @@ def with_preset(options: Dict[str, Any], name: Optional[str], device: str) -> Di
 def iterations_for_scene(config: TrainConfig, given: Collection[str], layout: Layout) -> int:
     """How long to train. given: names of options that are not to be chosen. layout: the scene's.
 
-    With few photographs 30,000 iterations were worse than fewer. That was seen where the number is chosen too, so it
+    On fox, by alpha, 30,000 iterations were worse than 15,000. That was seen where the number is chosen too, so it
     holds there alone. Who moves the end of growth and removals means a part of 30,000.
     """
     if config.budget or config.init or {"iterations", "densify_until_iter"} & {*given}:

@@ -138,8 +138,9 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
         cannot = ", since OpenCV cannot undistort them" if set(models) <= NOT_UNDISTORTED else ""
         why = (cannot or ", since undistortion would cut off much of them") if chosen else ""
         masked = any(shown_by_lens(view.camera) is not None for view in views)
+        bent = any(view.camera.lens and not view.camera.is_panorama for view in views)
         lines.append(f"images of camera model {', '.join(models)} stay as they are{why}; Gaussians are projected "
-                     f"through it, in a training each {EVERY}th time by a pinhole camera"
+                     f"through it{f', in a training each {EVERY}th time by a pinhole camera' * bent}"
                      f"{', pixels beyond the lens are masked' * masked}")
     if config.batch > len(scene.train):
         lines.append(f"note: a step of --batch {config.batch} shows some of the {len(scene.train)} training images "

@@ -19,11 +19,14 @@ EVERY = 16  # of so many views through lenses, one is shown by a pinhole
 
 
 class StraightViews:
-    """The pinhole images of views through lenses; they are made anew each time, as they would take as much memory."""
+    """The pinhole images of views through lenses; they are made anew each time, as they would take as much memory.
+
+    Panoramas have none: what a pinhole sees of them is a few columns, magnified.
+    """
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self._straight = {camera.name: dataclasses.replace(camera.pinhole(), name=f"{camera.name} (pinhole)")
-                          for camera in cameras if camera.lens}
+                          for camera in cameras if camera.lens and not camera.is_panorama}
 
     @property
     def cameras(self) -> List[Camera]:

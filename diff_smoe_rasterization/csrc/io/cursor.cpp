@@ -10,7 +10,6 @@ namespace dsmoe::io {
 namespace {
 
 constexpr std::string_view kBlanks = " \t\v\f\r";
-constexpr std::size_t kLongestQuote = 60;
 
 template <typename T> bool parse_all(std::string_view text, T& value) {
   const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
@@ -19,9 +18,9 @@ template <typename T> bool parse_all(std::string_view text, T& value) {
 
 }  // namespace
 
-std::string printable(std::string_view text) {
+std::string printable(std::string_view text, std::size_t longest) {
   std::string result = "\"";
-  for (const char c : text.substr(0, kLongestQuote)) {
+  for (const char c : text.substr(0, longest)) {
     if (c >= ' ' && c <= '~') {
       result += c;
       continue;
@@ -30,7 +29,7 @@ std::string printable(std::string_view text) {
     std::snprintf(escaped, sizeof(escaped), "\\x%02x", static_cast<unsigned char>(c));
     result += escaped;
   }
-  return result + (text.size() > kLongestQuote ? "...\"" : "\"");
+  return result + (text.size() > longest ? "...\"" : "\"");
 }
 
 bool parse_number(std::string_view text, double& value) {
