@@ -199,7 +199,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: O
     cameras = load_cameras(config, split or "test")
     if not cameras and not split:
         cameras = load_cameras(config, "train")
-        why = " (no image is held out: --test-every 0, in cfg_args eval=False)" if config.test_every == 0 else ""
+        why = " (no image is held out: --test-every 0, or eval=False in cfg_args)" if config.test_every == 0 else ""
         print(f"note: scene {printable(config.scene)} has no test views{why}; these are its training views",
               file=sys.stderr)
     if not cameras:
