@@ -174,6 +174,8 @@ def test_footprints_across_the_seam_are_drawn_on_both_sides(mode):
         images.append([blend_footprints(each, settings).color for each in (whole, prints)])
     assert_close(images[1][0].roll(width // 2, 2), images[0][0], FLOAT64_TOLERANCE, "color")
     assert (images[1][1].roll(width // 2, 2) - images[0][1]).abs().max() > 0.05, "a seam without the copies"
+    with pytest.raises(ValueError, match="around: width is 0; it must be that of the equirectangular image"):
+        prints.around(0)
 
 
 def test_copies_are_those_of_which_a_pixel_beyond_the_seam_can_see_something():
