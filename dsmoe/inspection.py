@@ -64,7 +64,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
         print(line)
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
-        raise TrainerError(f"scene {config.scene} has no {split or 'test'} views; --split names others")
+        raise TrainerError(f"scene {config.scene} has no {split} views; --split names others")
     masked = bool(earlier) and "masks" in earlier[0].get("protocol", {})
     if masked != any(view.mask is not None for view in views) and earlier:
         raise TrainerError(f"{config.scene} has {'no masks' if masked else 'masks'}, but the run was measured "

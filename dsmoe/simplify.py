@@ -146,8 +146,9 @@ def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], No
                 "the place of photographs, unless --scene names these")
         say(f"{start.path}: {start.count:,} Gaussians of SH degree {start.gaussians.sh_degree}, blend mode "
             f"{start.blend_text}, {os.path.getsize(start.path) / 1e6:.1f} MB")
-        if change_of_blend(start, config):
-            say(change_of_blend(start, config))
+        change = change_of_blend(start, config)
+        if change:
+            say(change)
         say(describe_scene(scene, layout, config))
     quality = check_start(scene, config)
     if finds_center and quality.is_centred:

@@ -302,8 +302,9 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         quality = check_start(scene, config)
         if say:
             say(f"{config.init}: blend mode {scene.start.blend_text}; {quality.text(config)}")
-            if change_of_blend(scene.start, config):
-                say(change_of_blend(scene.start, config))
+            change = change_of_blend(scene.start, config)
+            if change:
+                say(change)
     make_folder(config.output)  # a folder that cannot be made is told before images are read
     with contextlib.nullcontext(lock) if lock else only_one(config.output) as lock:
         earlier = earlier_files(config, resume, overwrite)  # again: another run may have been at work there
