@@ -22,7 +22,6 @@ from .results.evaluation import evaluate
 from .results.modelfile import (
     agreed_background_gate,
     agreed_blend_mode,
-    check_folder,
     model_path,
     read_gaussians,
     recorded_of,
@@ -136,8 +135,6 @@ def _read_start(path: str, *_: int) -> Start:
         raise TrainerError(f"{path}: {what}; `dsmoe export MODEL -o clean.glb` leaves such Gaussians out")
     recorded = recorded_of(path, gaussians)
     gaussians = dataclasses.replace(gaussians, blend_mode=recorded.blend_mode)  # or of its folder
-    if recorded.blend_mode is None:
-        check_folder(path)
     mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")
     return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None), recorded.faint_below)
 

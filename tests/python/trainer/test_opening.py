@@ -173,6 +173,13 @@ def test_a_learned_gate_that_no_file_records_is_asked_for(model, tiny_scene, tmp
         assert "with a learned background gate, but not its value; declare it" in capsys.readouterr().err
     assert main(["export", str(ply), "-o", declared, "--blend-mode", "smoe", "--background-gate", "0.125"]) == 0
     assert load_model(declared, "cpu")[1] == ("smoe", 0.125, None)
+    for words, wrong in ((["--blend-mode", "alpha"], "was trained with the blend mode smoe, not alpha"),
+                         (["--background-gate", "0.125", "--faint-below", "3"], "its faint_below is 1.5, not 3")):
+        (tmp_path / "model" / "cfg_args").write_text(text.replace("source", "faint_below=1.5, source"))
+        assert main(["export", str(tmp_path / "model"), "-o", str(tmp_path / "no.html"), *words]) == 1
+        assert wrong in capsys.readouterr().err
+    assert main(["export", str(ply), "-o", declared, "--background-gate", "0.5", "--overwrite"]) == 0
+    assert load_model(declared, "cpu")[1] == ("smoe", 0.5, 1.5), "the folder says the rest"
     (tmp_path / "model" / "cfg_args").write_text(text.replace("'learned'", "'much'"))
     assert main(["render", str(tmp_path / "model"), "-o", str(tmp_path / "no")]) == 1
     assert "cfg_args: of the blend smoe it records the background gate 'much'" in capsys.readouterr().err
