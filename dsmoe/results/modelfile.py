@@ -93,7 +93,7 @@ def read_gaussians(path: str) -> io.Gaussians:
         other = ("; it is compressed, as SuperSplat does: let that write a .ply that is not"
                  if "packed_position" in text else
                  "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
-                 if "no scalar property" in text else "")
+                 if "no scalar property" in text or "no element" in text else "")
         raise TrainerError(text + other) from error
 
 

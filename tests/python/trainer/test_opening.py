@@ -16,7 +16,7 @@ from dsmoe.options.config import TrainConfig
 from dsmoe.results.glb import glb_bytes
 from dsmoe.results.modelfile import load_model
 from dsmoe.scenes.scene import load_scene
-from dsmoe.starting import read_start
+from dsmoe.starting import find_model, read_start
 from dsmoe.view.following import Followed
 
 ENDINGS = ("ply", "splat", "spz", "glb")
@@ -96,7 +96,7 @@ def test_a_glb_is_of_alpha_unless_it_says_otherwise(model, tmp_path, capsys):
     assert not (tmp_path / "no.ply").exists()
 
 
-def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_path, capsys):
+def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_path, capsys, monkeypatch):
     ply, folder = exported(model, tmp_path, "ply"), tmp_path / "model"
     for iteration in (7000, 30000):
         place = folder / "point_cloud" / f"iteration_{iteration}"
@@ -113,16 +113,23 @@ def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_p
     assert Followed(str(folder)).renderer.background.tolist() == [1, 1, 1]
     assert main(["export", str(folder), "-o", str(tmp_path / "page.html")]) == 0
     (folder / "cfg_args").write_text(said % "nowhere")
+    nowhere = f"{os.path.abspath('nowhere')} or {folder / 'nowhere'}"
     capsys.readouterr()
     assert main(["render", str(folder), "-o", str(tmp_path / "no")]) == 1
     assert capsys.readouterr().err.endswith(
-        f"{folder} holds no cameras, and the scene that it names, nowhere, is not there; name the folder that has "
-        "them with --scene\n")
+        f"{folder} holds no cameras, and the scene that it names, {nowhere}, is not there; name the folder that "
+        "has them with --scene\n")
     assert main(["simplify", str(folder), "--keep", "0.5", "-o", str(tmp_path / "no")]) == 1
-    assert "the scene that its folder names, nowhere, is not there, and the folder has no cameras.json; name its " \
+    assert f"the scene that its folder names, {nowhere}, is not there, and the folder has no cameras.json; name its " \
            "scene with --scene" in capsys.readouterr().err
     assert main(["export", str(folder), "-o", str(tmp_path / "gone.html")]) == 0
-    assert f"note: the scene that {folder} names, nowhere, is not there" in capsys.readouterr().err
+    assert f"note: the scene that {folder} names, {nowhere}, is not there" in capsys.readouterr().err
+    (folder / "cfg_args").write_text(said % "there")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for place in (folder / "there", tmp_path / "here" / "there"):  # the second counts more
+        shutil.copytree(tiny_scene, place)
+        assert find_model(str(folder)).options["scene"] == str(place)
     shutil.rmtree(folder / "point_cloud")
     for command in (["render"], ["view"], ["export"]):
         assert main([*command, str(folder), *["-o", str(tmp_path / "no.html")][:2 * (command != ["view"])]]) == 1
@@ -187,7 +194,9 @@ def test_a_learned_gate_that_no_file_records_is_asked_for(model, tiny_scene, tmp
 
 @pytest.mark.parametrize("ending, content, words", [
     ("splat", bytes(33), "33 bytes; a .splat has 32 for each Gaussian"), ("glb", b"glTF", "not a .glb of Gaussians"),
-    ("ksplat", bytes(64), "it is none of .ply, .splat, .spz and .glb"), ("ply", bytes(64), "this is no PLY file")])
+    ("ksplat", bytes(64), "it is none of .ply, .splat, .spz and .glb"), ("ply", bytes(64), "this is no PLY file"),
+    ("ply", b"", 'it has 0 bytes, so this is no PLY file, whose first line is "ply"'),
+    ("ply", b"ply\nformat ascii 1.0\nend_header\n", 'no element "vertex"; it is not a model of Gaussians')])
 def test_what_is_no_model_is_named_by_every_command(tiny_scene, tmp_path, capsys, ending, content, words):
     path = tmp_path / f"model.{ending}"
     path.write_bytes(content)
