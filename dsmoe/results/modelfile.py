@@ -100,7 +100,7 @@ def read_gaussians(path: str) -> io.Gaussians:
 def recorded_of(path: str, stored: io.Gaussians) -> Recorded:
     """What a file says of its blend, else the cfg_args of the 3DGS model folder that it lies in.
 
-    Raises TrainerError if its comment on `faint_below` is wrong.
+    Raises TrainerError for a comment on `faint_below`, and for values of cfg_args, that no training has.
     """
     said = [line.partition(" ")[2] for line in stored.comments if line.startswith(FAINT_BELOW + " ")]
     try:

@@ -136,11 +136,16 @@ def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_p
         assert "no model is in it: neither config.json of `dsmoe train` nor" in capsys.readouterr().err
 
 
-def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, tiny_scene, tmp_path, capsys):
+def in_model_folder(model, tmp_path, cfg_args):
+    """The path of the model, which records no blend, in a model folder of 3DGS whose trainer was given these."""
     place = tmp_path / "model" / "point_cloud" / "iteration_7"
     place.mkdir(parents=True)
-    shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
-    (tmp_path / "model" / "cfg_args").write_text(f"Namespace(eval=False, source_path={str(tiny_scene)!r})")
+    (tmp_path / "model" / "cfg_args").write_text(f"Namespace({cfg_args})")
+    return shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
+
+
+def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, tiny_scene, tmp_path, capsys):
+    in_model_folder(model, tmp_path, f"eval=False, source_path={str(tiny_scene)!r}")
     words = ["render", str(tmp_path / "model"), "-o", str(tmp_path / "images")]
     assert main([*words, "--split", "test"]) == 1 and "has no test views" in capsys.readouterr().err
     assert main(words) == 0
@@ -155,39 +160,34 @@ def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, ti
     ("blend_mode='smoe_eq7', background_gate=''", ("smoe_eq7", 0, None)), ("blend_mode='other'", ("alpha", 1, None))])
 def test_cfg_args_says_how_a_file_without_a_record_is_blended(model, tiny_scene, tmp_path, said, blend):
     """None: as usual. What the file itself records counts more."""
-    place, copy = tmp_path / "model" / "point_cloud" / "iteration_7", str(tmp_path / "copy.ply")
-    place.mkdir(parents=True)
-    shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
-    (tmp_path / "model" / "cfg_args").write_text(f"Namespace({said}, source_path={str(tiny_scene)!r})")
+    copy, ply = str(tmp_path / "copy.ply"), in_model_folder(model, tmp_path, f"{said}, source_path={str(tiny_scene)!r}")
     opened = open_trained(str(tmp_path / "model")).renderer
     assert (opened.blend_mode, opened.background_gate, opened.faint_below) == blend
-    start = read_start(str(place / "point_cloud.ply"))
+    start = read_start(str(ply))
     assert (start.blend_mode, start.background_gate, start.faint_below) == blend
     assert main(["export", str(tmp_path / "model"), "-o", copy]) == 0
     assert io.read_gaussians(copy).blend_mode == (None if "other" in said else blend[0])
-    io.write_gaussians(str(place / "point_cloud.ply"), dataclasses.replace(model, blend_mode="smoe_std"))
+    io.write_gaussians(str(ply), dataclasses.replace(model, blend_mode="smoe_std"))
     assert open_trained(str(tmp_path / "model")).renderer.blend_mode == "smoe_std"
 
 
 def test_a_learned_gate_that_no_file_records_is_asked_for(model, tiny_scene, tmp_path, capsys):
-    place, declared = tmp_path / "model" / "point_cloud" / "iteration_7", str(tmp_path / "declared.ply")
-    place.mkdir(parents=True)
-    ply = shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
-    text = f"Namespace(blend_mode='smoe', background_gate='learned', source_path={str(tiny_scene)!r})"
-    (tmp_path / "model" / "cfg_args").write_text(text)
+    declared, cfg_args = str(tmp_path / "declared.ply"), tmp_path / "model" / "cfg_args"
+    said = f"blend_mode='smoe', background_gate='learned', source_path={str(tiny_scene)!r}"
+    ply, text = in_model_folder(model, tmp_path, said), cfg_args.read_text()
     for words in (["render", "-o", str(tmp_path / "no")], ["simplify", "--keep", "1", "-o", str(tmp_path / "no")]):
         assert main([words[0], str(tmp_path / "model"), *words[1:]]) == 1
         assert "with a learned background gate, but not its value; declare it" in capsys.readouterr().err
     assert main(["export", str(ply), "-o", declared, "--blend-mode", "smoe", "--background-gate", "0.125"]) == 0
     assert load_model(declared, "cpu")[1] == ("smoe", 0.125, None)
+    cfg_args.write_text(text.replace("source", "faint_below=1.5, source"))
     for words, wrong in ((["--blend-mode", "alpha"], "was trained with the blend mode smoe, not alpha"),
                          (["--background-gate", "0.125", "--faint-below", "3"], "its faint_below is 1.5, not 3")):
-        (tmp_path / "model" / "cfg_args").write_text(text.replace("source", "faint_below=1.5, source"))
         assert main(["export", str(tmp_path / "model"), "-o", str(tmp_path / "no.html"), *words]) == 1
         assert wrong in capsys.readouterr().err
     assert main(["export", str(ply), "-o", declared, "--background-gate", "0.5", "--overwrite"]) == 0
     assert load_model(declared, "cpu")[1] == ("smoe", 0.5, 1.5), "the folder says the rest"
-    (tmp_path / "model" / "cfg_args").write_text(text.replace("'learned'", "'much'"))
+    cfg_args.write_text(text.replace("'learned'", "'much'"))
     assert main(["render", str(tmp_path / "model"), "-o", str(tmp_path / "no")]) == 1
     assert "cfg_args: of the blend smoe it records the background gate 'much'" in capsys.readouterr().err
 
