@@ -61,6 +61,11 @@ def grouped(rows: Iterable[Row], *names: str) -> Dict[Tuple, List[Row]]:
     return found
 
 
+def in_order(cells: Dict[Tuple, Any], sign: int = -1) -> Dict[Tuple, Any]:
+    """Cells by (scene, amount): scenes as in SCENES, the largest amounts first; sign 1: last."""
+    return dict(sorted(cells.items(), key=lambda item: (SCENES.index(item[0][0]), sign * item[0][1])))
+
+
 def mean(rows: Sequence[Row], name: str) -> float:
     return statistics.fmean(row[name] for row in rows)
 
@@ -73,6 +78,11 @@ def shown(rows: Sequence[Row], name: str, digits: int) -> str:
 def thousands(rows: Sequence[Row]) -> str:
     number = mean(rows, "num_gaussians") / 1000
     return f"{number:,.{0 if number > 99.95 else 1}f}k"
+
+
+def quality(rows: Sequence[Row]) -> str:
+    """PSNR and number of Gaussians."""
+    return f"{shown(rows, 'psnr', 2)}, {thousands(rows)}"
 
 
 def figures(rows: Sequence[Row]) -> List[str]:
@@ -103,16 +113,16 @@ def signed(value: float, digits: int) -> str:
 def budget_table(rows: Sequence[Row]) -> str:
     """A line for each scene and number of Gaussians; differences are of runs with the same seed."""
     lines = []
-    for (scene, budget), cells in grouped((row for row in rows if row["budget"]), "scene", "budget").items():
+    of_budgets = grouped((row for row in rows if row["budget"]), "scene", "budget")
+    for (scene, budget), cells in in_order(of_budgets, 1).items():
         alpha, smoe = (grouped(cells, "blend_mode")[blend,] for blend in BLENDS)
         of_seed = {row["seed"]: row["psnr"] for row in alpha}
         smoe.sort(key=lambda row: row["seed"])
         differences = [f"{row['psnr'] - of_seed[row['seed']]:+.2f}" for row in smoe]
         both = [figure for rows in (alpha, smoe) for figure in figures(rows)[::2]]  # without SSIM
-        lines.append((SCENES.index(scene), budget, [f"{scene}, {budget:,}", *both,
-                                                    ", ".join(differences), signed(less(smoe, alpha, "psnr_edge"), 2)]))
+        lines.append([f"{scene}, {budget:,}", *both, ", ".join(differences), signed(less(smoe, alpha, "psnr_edge"), 2)])
     return table(["scene, Gaussians", "alpha: PSNR", "LPIPS", "smoe: PSNR", "LPIPS", "difference by seed",
-                  "near edges"], (line for *_, line in sorted(lines)))
+                  "near edges"], lines)
 
 
 def recipe_cells() -> Dict[Tuple[str, float], Dict[str, List[Row]]]:
@@ -124,18 +134,15 @@ def recipe_cells() -> Dict[Tuple[str, float], Dict[str, List[Row]]]:
     for (scene, threshold, blend), cells in grouped(fixed, "scene", "densify_grad_threshold", "blend_mode").items():
         if blend in ("smoe", "smoe_eq7"):
             found[scene, threshold]["gate 0" if blend == "smoe" else "Eq. 7"] = cells
-    return dict(sorted(found.items(), key=lambda item: (SCENES.index(item[0][0]), -item[0][1])))
+    return in_order(found)
 
 
 def recipe_table() -> str:
     """A line for each scene and threshold: PSNR and number; what smoe gains near edges."""
-    lines = []
-    for (scene, threshold), rules in recipe_cells().items():
-        line = [f"{scene} {threshold:g}", *(f"{shown(rules[blend], 'psnr', 2)}, {thousands(rules[blend])}"
-                                            for blend in BLENDS)]
-        line.append(signed(less(rules["smoe"], rules["alpha"], "psnr_edge"), 1))
-        lines.append(line)
-    return table(["", "alpha", "smoe", "near edges"], lines)
+    return table(["", "alpha", "smoe", "near edges"], (
+        [f"{scene} {threshold:g}", *(quality(rules[blend]) for blend in BLENDS),
+         signed(less(rules["smoe"], rules["alpha"], "psnr_edge"), 1)]
+        for (scene, threshold), rules in recipe_cells().items()))
 
 
 def number_at(points: Sequence[Tuple[float, float]], psnr: float) -> Optional[float]:
@@ -214,8 +221,7 @@ def ablations() -> Dict[Tuple[float, str], List[Row]]:
 def transmittance_table() -> str:
     cells = ablations()
     return table(["bonsai", "Eq. 7", *ABLATED.values()], (
-        [f"{end:g}", *(f"{shown(cells[end, blend], 'psnr', 2)}, {thousands(cells[end, blend])}"
-                       for blend in ("smoe_eq7", *ABLATED))] for end in (0.005, 0.0002)))
+        [f"{end:g}", *(quality(cells[end, blend]) for blend in ("smoe_eq7", *ABLATED))] for end in (0.005, 0.0002)))
 
 
 TRAINERS = {"3dgs-2023": "3DGS of 2023", "c3dgs": "c3dgs", "compact-3dgs": "Compact-3DGS", "taming": "Taming",
@@ -362,20 +368,18 @@ def rules_table() -> str:
     rows = [row for row in rows_of("tails_h100.jsonl") if row["strategy"] == "3dgs"]
     columns = {"Eq. 7": ("smoe_eq7", 0), "Eq. 7, gate 0.03": ("smoe_eq7", 0.03),
                "smoe, λ = 0, `faint_below` 2": ("smoe", 0)}
-    lines = []
-    for (scene, threshold), cells in grouped(rows, "scene", "densify_grad_threshold").items():
-        by_rule = grouped(cells, "blend_mode", "background_gate")
-        line = [f"{shown(by_rule[rule], 'psnr', 2)}, {thousands(by_rule[rule])}" if rule in by_rule else "–"
-                for rule in columns.values()]
-        lines.append((SCENES.index(scene), -threshold, [f"{scene} {threshold:g}", *line]))
-    return table(["", *columns], (line for *_, line in sorted(lines)))
+    cells = {key: grouped(found, "blend_mode", "background_gate")
+             for key, found in in_order(grouped(rows, "scene", "densify_grad_threshold")).items()}
+    return table(["", *columns], (
+        [f"{scene} {threshold:g}", *(quality(rules[rule]) if rule in rules else "–" for rule in columns.values())]
+        for (scene, threshold), rules in cells.items()))
 
 
 def simplified() -> Dict[Tuple[str, int], Dict[Tuple[str, str], List[Row]]]:
     """Runs of `dsmoe simplify` by scene and budget, then by teacher and blend."""
     rows = [row for row in rows_of("simplify_h200.jsonl") if row.get("run") == 2]
-    cells = sorted(grouped(rows, "scene", "budget").items(), key=lambda item: (SCENES.index(item[0][0]), -item[0][1]))
-    return {key: grouped(found, "teacher", "blend_mode") for key, found in cells}
+    return {key: grouped(found, "teacher", "blend_mode")
+            for key, found in in_order(grouped(rows, "scene", "budget")).items()}
 
 
 def simplify_table() -> str:

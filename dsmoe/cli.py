@@ -208,14 +208,14 @@ def _train_in(group: Group, config: TrainConfig, layout: Optional[Layout], argum
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
-    if config.strategy == STRATEGY and not arguments.resume and not getattr(arguments, "budget", 0):
+    chooses = config.strategy == STRATEGY and not arguments.resume
+    if chooses and not getattr(arguments, "budget", 0):
         whose = "that of the model" if config.init else "chosen for the scene"
         print(f"note: that number is {whose}; --budget N makes more or fewer, and --strategy 3dgs is the "
               "densification of 3DGS")
-        if config.iterations < TrainConfig.iterations and not (
-                hasattr(arguments, "iterations") or arguments.fast or arguments.best):
-            print("note: fewer iterations, as the scene has few photographs; --iterations N sets another number, and "
-                  f"with --budget it is {TrainConfig.iterations}")
+    if chooses and config.iterations < TrainConfig.iterations and not (
+            hasattr(arguments, "iterations") or arguments.fast or arguments.best):
+        print("note: fewer iterations, as the scene has few photographs; --iterations N sets another number")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,

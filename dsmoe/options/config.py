@@ -5,6 +5,7 @@ import dataclasses
 import glob
 import json
 import os
+import shlex
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 
@@ -88,7 +89,7 @@ class TrainConfig:
               "in smoe_eq7)")
     iterations: int = _option(
         30_000, "views to train on, a view each step; with --batch B, B each step. importance takes fewer for few "
-                "photographs where it also chooses the number of Gaussians")
+                "photographs, unless the budget is below the number that it would choose")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
     resolution: int = _option(
@@ -404,7 +405,8 @@ class TrainConfig:
         differences = self.differences(later)
         if differences:
             raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `dsmoe train "
-                              f"--resume -o {self.output}` keeps the run's options; more --iterations extend it")
+                              f"--resume -o {shlex.quote(self.output)}` keeps the run's options; more --iterations "
+                              "extend it")
 
 
 def _recipe_of(strategy: str) -> Dict[str, Any]:
