@@ -24,9 +24,10 @@ ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), 
 # Results that need another walk, by `contributions` or `gate_map`.
 COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums")
 MAPPED = ("largest", "median_depth")
-# Of arguments that are read before `rasterize` looks at them; others have N rows.
+# Of arguments that are looked at before `rasterize` does; others have N rows.
 AXES = {"means3D": ("N", 3), "means2D": ("N", "D"), "means2D_densify": ("N", 3), "dc": ("N", 1, 3),
-        "shs": ("N", "K", 3), "colors_precomp": ("N", "C"), "theta": (3,), "rho": (3,)}
+        "shs": ("N", "K", 3), "colors_precomp": ("N", "C"), "opacities": ("N", 1), "scales": ("N", 3),
+        "rotations": ("N", 4), "cov3D_precomp": ("N", 6), "theta": (3,), "rho": (3,)}
 
 
 # Settings beside the package's own, by what they must be if they are not None.
@@ -74,6 +75,7 @@ def given_inputs(settings: Settings, inputs: Dict[str, Any]) -> Dict[str, Any]:
                 value = None
             else:
                 axes = AXES.get(name, ("N", *value.shape[1:]))
+                axes = ("N",) if name == "opacities" and value.dim() == 1 else axes
                 flat = value.reshape(-1) if axes == (3,) else value
                 _check_axes(name, flat, (len(means), *axes[1:]) if axes[0] == "N" and name != "means3D" else axes)
         checked[name] = value

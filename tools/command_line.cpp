@@ -100,6 +100,9 @@ void CommandLine::check_output(const std::string& file, const std::string& folde
         throw UsageError(quoted(place.string()) + " is a link, and nothing is written there; -o names another");
       }
     }
+  } else if (const fs::path place = fs::path(file).parent_path(); !place.empty() && !fs::is_directory(place, ignored)) {
+    throw UsageError(quoted(file) + " has no folder to be in: make " + quoted(place.string()) +
+                     ", or name another by -o");
   }
   const fs::file_status status = fs::symlink_status(file, ignored);
   if (!fs::exists(status)) return;

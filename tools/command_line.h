@@ -34,7 +34,7 @@ class CommandLine {
   std::vector<double> numbers(const std::string& name, const std::vector<double>& missing, std::size_t count) const;
 
   /// The rule for a file that a program writes: it is not there, or it is a regular file and --overwrite is given, and
-  /// no link lies between `folder` and it. Throws UsageError.
+  /// no link lies between `folder` and it. `folder` may still be to make, any other folder is there. Throws UsageError.
   void check_output(const std::string& file, const std::string& folder = "") const;
 
  private:

@@ -173,7 +173,7 @@ int run(int argc, char** argv) {
   const std::string output = line.text("output", "");
   if (output.empty()) throw UsageError("-o FOLDER is needed");
   const auto file = [&](const char* name) { return (fs::path(output) / name).string(); };
-  for (const char* name : kResults) line.check_output(file(name));
+  for (const char* name : kResults) line.check_output(file(name), output);
   const Picture picture = choose_picture(line);
   FitOptions options;
   options.kernels = line.whole("kernels", options.kernels, 1, 1000000);

@@ -3,7 +3,9 @@
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
+#include <map>
 #include <optional>
+#include <set>
 #include <thread>
 
 #include "command_line.h"
@@ -104,6 +106,9 @@ ImageSize read_size(const CommandLine& line) {
   if (found != (with_height ? 2 : 1) || std::sscanf(text.c_str(), with_height ? "%*dx%*d%c" : "%*d%c", &behind) == 1 ||
       size.width < 1 || (with_height && size.height < 1)) {
     throw UsageError("--size is \"" + text + "\"; it must be like 1280x720 or 1280");
+  }
+  if (size.width > kLargestSide || size.height > kLargestSide) {
+    throw UsageError("--size is \"" + text + "\"; it must be at most 16384 pixels a side");
   }
   return size;
 }
@@ -213,16 +218,34 @@ class Painter {
   std::optional<std::pair<float, float>> span_;
 };
 
-/// Where a picture of the view goes in `folder`; folders of the image's name are made.
-std::string picture_path(const fs::path& folder, const View& view, const std::string& format) {
+/// Where the picture of a name goes in `folder`; folders of the name are made.
+fs::path picture_path(const fs::path& folder, const std::string& name, const std::string& format) {
   // No part of a name in a file may lead out of the folder.
   fs::path path = folder;
-  for (const fs::path& part : fs::path(view.name).relative_path()) {
+  for (const fs::path& part : fs::path(name).relative_path()) {
     if (part != ".." && part != ".") path /= part;
   }
   if (path == folder) path /= "view";
-  path.replace_extension("." + format);
-  return path.string();
+  return path.replace_extension("." + format);
+}
+
+/// The path of each view's picture. Equal ones get a number: a cameras.json of 3DGS names images by their first word,
+/// without folders.
+std::vector<std::string> picture_paths(const fs::path& folder, const std::vector<View>& views,
+                                       const std::string& format) {
+  std::vector<std::string> paths;
+  std::set<std::string> taken;
+  std::map<std::string, int> counts;
+  for (const View& view : views) {
+    const fs::path first = picture_path(folder, view.name, format);
+    fs::path path = first;
+    for (int& count = counts[first.string()]; !taken.insert(path.string()).second;) {
+      count = std::max(count, 1) + 1;
+      path = first.parent_path() / (first.stem().string() + "_" + std::to_string(count) + "." + format);
+    }
+    paths.push_back(path.string());
+  }
+  return paths;
 }
 
 std::unique_ptr<Renderer> make_renderer(const CommandLine& line, const Model& model, RenderOptions options) {
@@ -270,8 +293,11 @@ int run(int argc, char** argv) {
                      "-o names a folder or an .mp4");
   }
   if (is_video || is_picture) line.check_output(output);
-  for (const View& view : views) {
-    if (!is_video && !is_picture) line.check_output(picture_path(output, view, format), output);
+  const std::vector<std::string> paths = is_video     ? std::vector<std::string>{}
+                                         : is_picture ? std::vector{output}
+                                                      : picture_paths(output, views, format);
+  for (const std::string& path : paths) {
+    if (!is_picture) line.check_output(path, output);
   }
   const std::unique_ptr<Renderer> renderer = make_renderer(line, model, options);
   Painter paint(show, format == "exr" && !is_video);
@@ -284,9 +310,8 @@ int run(int argc, char** argv) {
     if (is_video) {
       video->write(picture);
     } else {
-      const std::string path = is_picture ? output : picture_path(output, view, format);
-      if (!is_picture) fs::create_directories(fs::path(path).parent_path());
-      write_picture(path, picture);
+      if (!is_picture) fs::create_directories(fs::path(paths[i]).parent_path());
+      write_picture(paths[i], picture);
     }
     progress.show(static_cast<int>(i) + 1);
   }

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 
 import pytest
 import torch
@@ -129,6 +130,15 @@ def test_empty_cpu_tensors_are_absent_inputs(flavour, mode):
             **scene.inputs, **absent)
         assert len(absent) >= 2
         assert_close(results[0], reference_gradients(scene)[0].color, TOLERANCE, "color")
+
+
+@pytest.mark.parametrize("name, shape, right", [
+    ("rotations", [4], [40, 4]), ("opacities", [1, 40], [40, 1]), ("scales", [3], [40, 3]),
+    ("cov3D_precomp", [40], [40, 6])])
+def test_an_error_names_the_right_shape(flavour, scene, name, shape, right):
+    inputs = {**scene.inputs, name: torch.ones(shape, dtype=torch.float64)}
+    with pytest.raises(ValueError, match=re.escape(f"{name} has shape {shape}; it must be {right}")):
+        flavour.GaussianRasterizer(settings_of(flavour, scene.settings))(**inputs)
 
 
 @pytest.mark.parametrize("wrong", [{"shs": None}, {"colors_precomp": True}, {"scales": None}, {"cov3D_precomp": True}])

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 from pathlib import Path
 
@@ -122,6 +123,32 @@ def test_no_name_in_a_file_leads_out_of_the_folder(tmp_path):
     cameras.write_text(cameras.read_text().replace("./images/view.png", "../../outside/view.png"))
     tool("dsmoe_render", tmp_path / "model.ply", "--cameras", cameras, "--device", "cpu", "-o", tmp_path / "a" / "out")
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png")] == ["a/out/outside/view.png"]
+
+
+def test_equal_names_of_views_get_pictures_of_their_own(tmp_path):
+    io.write_gaussians(tmp_path / "model.ply", model("alpha"))
+    cameras = write_cameras(tmp_path, "cameras.json")
+    camera = json.loads(cameras.read_text())[0]
+    names = ["view", "view", "frame.0001", "view_2", "frame.0002", "view"]
+    cameras.write_text(json.dumps([{**camera, "img_name": name, "width": 10 + i} for i, name in enumerate(names)]))
+    words = [tmp_path / "model.ply", "--cameras", cameras, "--device", "cpu", "-o", tmp_path / "out"]
+    tool("dsmoe_render", *words)
+    widths = {path.name: Image.open(path).width for path in (tmp_path / "out").iterdir()}
+    assert widths == {"view.png": 10, "view_2.png": 11, "frame.png": 12, "view_2_2.png": 13, "frame_2.png": 14,
+                      "view_3.png": 15}
+    assert 'view.png" is there already' in tool("dsmoe_render", *words, status=2)
+
+
+def test_what_cannot_be_written_is_said_before_the_work(tmp_path):
+    io.write_gaussians(tmp_path / "model.ply", model("alpha"))
+    orbit = [tmp_path / "model.ply", "--orbit", "--frames", 1, "--device", "cpu"]
+    for end in ("mp4", "png"):
+        said = tool("dsmoe_render", *orbit, "--size", 32, "-o", tmp_path / "no" / f"out.{end}", status=2)
+        assert f'make "{tmp_path / "no"}"' in said
+    said = tool("dsmoe_render", *orbit, "--size", "100000x100000", "-o", tmp_path / "out.png", status=2)
+    assert '"100000x100000"; it must be at most 16384' in said
+    said = tool("dsmoe_render", *orbit, "--size", 32, "-o", f"{tmp_path / 'model.ply'}/", status=1)
+    assert re.search(r"model\.ply/?: Not a directory", said) and "filesystem error" not in said
 
 
 def test_alpha_is_the_packages(tmp_path):
