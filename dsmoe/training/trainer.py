@@ -112,7 +112,8 @@ class Trainer:
         if self.config.device == "cpu":
             return None
         pixels = max(view.camera.width * view.camera.height for view in self.scene.train)
-        free = [numbers[0] for numbers in self.group.gather_numbers([free_bytes(pixels)], self.config.device)]
+        here = free_bytes(pixels, self.straight.map_bytes)
+        free = [numbers[0] for numbers in self.group.gather_numbers([here], self.config.device)]
         return self.num_gaussians + self.group.size * min(free) // gaussian_bytes(self.config)
 
     def whole_model(self) -> Optional[GaussianModel]:

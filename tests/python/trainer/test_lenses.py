@@ -21,12 +21,14 @@ from dsmoe.inspection import open_trained
 from dsmoe.options.config import TrainConfig
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.cameras import Camera
+from dsmoe.scenes.images import View
 from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.scenes.straight import EVERY, straightened
+from dsmoe.scenes.straight import EVERY, KEPT, StraightViews, _places, pinhole_every, straightened
 from dsmoe.system.files import ABANDONED, PART
+from dsmoe.train import PROGRESS_EVERY
 from dsmoe.training.trainer import Trainer
 
 WIDTH, HEIGHT = 96, 72
@@ -171,6 +173,8 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
     assert row["psnr"] > 25, "33.8 dB after 1000; as a pinhole it would not even show what lies beside the camera"
     assert main(["eval", output, "--device", "cpu"]) == 0
     assert f"{row['psnr']:.2f}" in capsys.readouterr().out
+    with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
+        assert json.load(file)[0]["protocol"]["pinhole_every"] == row["protocol"]["pinhole_every"] == EVERY
     assert main(["render", output, "--split", "test", "-o", str(tmp_path / "test"), "--device", "cpu"]) == 0
     shown, photograph = (np.asarray(Image.open(path).convert("RGB"), np.float64) for path in (
         next((tmp_path / "test").glob("**/0.png")), tmp_path / "scene" / "images" / "0.png"))
@@ -197,10 +201,31 @@ def test_a_training_through_a_lens_shows_pinhole_images_too(tmp_path):
     trainer = Trainer(config, load_scene(config, progress=False))
     shown = [trainer.step().view.camera for _ in range(config.iterations)]
     pinholes = [camera for camera in shown if not camera.lens]
-    assert pinholes == [shown[EVERY - 1], shown[2 * EVERY - 1]]
+    assert pinholes == [shown[EVERY - 2], shown[2 * EVERY - 2]]
     poses = {f"{view.camera.name} (pinhole)": view.camera for view in trainer.scene.train}
     for camera in pinholes:
         assert (camera.center == poses[camera.name].center).all() and camera.fx == WIDTH / 2, "90 degrees across"
+    view = trainer.scene.train[0]
+    for interval in PROGRESS_EVERY.values():
+        samples = [trainer.straight.of(view, iteration) for iteration in range(interval, 20 * interval, interval)]
+        assert all(sample is view for sample in samples), "of the loss curve, which would show two kinds of images"
+    assert pinhole_every([view], EVERY) == EVERY and pinhole_every([view], EVERY - 1) == 0
+    assert pinhole_every([straight(view)], EVERY) == 0
+
+
+def test_maps_of_many_lenses_take_as_much_memory_as_is_told():
+    """Of more lenses than are kept; what is shown does not depend on what was kept."""
+    image = torch.randint(0, 256, (3, HEIGHT, WIDTH), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    views = [View(Camera(f"{index}", np.eye(3), np.zeros(3), FX + index, FY, CX, CY, WIDTH, HEIGHT,
+                         lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})), image) for index in range(KEPT + 2)]
+    many = StraightViews([view.camera for view in views])
+    for _ in range(2):
+        for view in views:
+            shown, alone = many.of(view, EVERY - 1), straight(view)
+            assert (shown.image == alone.image).all() and (shown.mask == alone.mask).all()
+    grid, mask = _places(views[0].camera, views[0].camera.pinhole(), "cpu")
+    assert many._places.cache_info().currsize == KEPT
+    assert many.map_bytes == KEPT * (grid.nbytes + mask.nbytes) and StraightViews([]).map_bytes == 0
 
 
 def test_pinhole_images_keep_masks(tmp_path):
@@ -283,6 +308,7 @@ def test_renderings_through_a_lens_are_masked(tmp_path, capsys):
     with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
         protocol = json.load(file)[0]["protocol"]
     assert protocol["scene_kind"] == "model" and protocol["masks"]
+    assert "pinhole_every" not in protocol, "4 iterations have none"
 
 
 @pytest.mark.parametrize("model, params, words", [
