@@ -24,7 +24,7 @@ Map = Tuple[torch.Tensor, torch.Tensor]
 
 def pinhole_every(views: Sequence[View], iterations: int) -> int:
     """Of how many views of a training on these one is shown by a pinhole; 0: none is."""
-    return EVERY if iterations >= EVERY and any(_is_bent(view.camera) for view in views) else 0
+    return EVERY if iterations > 1 and any(_is_bent(view.camera) for view in views) else 0
 
 
 def _is_bent(camera: Camera) -> bool:
@@ -91,7 +91,7 @@ class StraightViews:
     def of(self, view: View, iteration: int) -> View:
         """What the training shows in this iteration: the view, or in each so many one, what a pinhole camera sees.
 
-        These iterations are odd: the loss curve takes every 10th or 100th, so all of its samples are through the lens.
+        These iterations are odd, since the loss curve takes every 10th or 100th, and not among the last ones.
         """
         camera = self._straight.get(view.camera.name)
-        return view if camera is None or iteration % EVERY != EVERY - 1 else straightened(view, camera, self._places)
+        return view if camera is None or iteration % EVERY != 1 else straightened(view, camera, self._places)
