@@ -18,6 +18,7 @@ from ..system.process import command
 from .evaluation import Evaluation
 
 RESULTS_NAME = "results.json"
+SSIM = "8-bit images, 11x11 window, sigma 1.5, zero padding, mean over test views"
 
 
 def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seconds: Optional[float],
@@ -63,6 +64,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["lenses"] = "native"
     if pinhole_every:
         unusual["pinhole_every"] = pinhole_every
+    if any(view.camera.is_panorama for view in views):
+        unusual["ssim"] = f"{SSIM}; windows of panoramas go across their seam"
     if any(view.mask is not None for view in views):
         unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"
     return {
@@ -90,7 +93,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
             "iterations": config.iterations,
             "seed": config.seed,
             "psnr": "8-bit images, mean over test views; psnr_float: floats clamped to [0, 1]",
-            "ssim": "8-bit images, 11x11 window, sigma 1.5, zero padding, mean over test views",
+            "ssim": SSIM,
             **unusual,
             "device": config.device,
             "machine": machine(config.device),

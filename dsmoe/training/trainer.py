@@ -192,10 +192,10 @@ class Trainer:
     def loss_of(self, view: View, target: torch.Tensor, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         """The loss of a rendering and its gradient."""
         self._report = (image, target, view)
-        mask = view.mask_float()
+        mask, padding = view.mask_float(), view.camera.padding
         if mask is None:
-            return self.strategy.loss(self.iteration, image, target)
-        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask)
+            return self.strategy.loss(self.iteration, image, target, padding)
+        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask, padding)
         return loss, gradient * mask
 
     def training_psnr(self) -> float:

@@ -19,6 +19,8 @@ from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import SceneError
 from dsmoe.inspection import open_trained
 from dsmoe.options.config import TrainConfig
+from dsmoe.results.evaluation import Evaluation, evaluate
+from dsmoe.results.rows import result_row
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.cameras import Camera
 from dsmoe.scenes.images import View
@@ -348,6 +350,8 @@ def test_panoramas_of_colmap(tmp_path):
     assert settings.camera_model == "equirectangular" and (settings.image_width, settings.image_height) == (64, 32)
     said = describe_scene(scene, layout, config)
     assert "EQUIRECTANGULAR stay as they are, since OpenCV cannot undistort them; Gaussians" in said
+    protocol = result_row(config, scene, 1, 0.0, Evaluation({}, None, []))["protocol"]
+    assert protocol["ssim"].endswith("go across their seam") and "pinhole_every" not in protocol
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
@@ -358,12 +362,12 @@ def test_a_panorama_has_no_seam(tmp_path, mode):
         image = Image.fromarray(np.roll(photograph, 32 * turned, 1))
         folder = write_scene(tmp_path / str(turned), "EQUIRECTANGULAR", [64, 32], image, 1, (64, 32), turned)
         options = dict(blend_mode=mode, background_gate=0.0) if mode == "smoe" else dict(blend_mode=mode)
-        config = TrainConfig(scene=folder, iterations=20, test_every=0, device="cpu", lambda_dssim=0.0,  # by windows,
-                             deterministic=True, **options)  # which do not go across the seam
+        config = TrainConfig(scene=folder, iterations=20, test_every=0, device="cpu", deterministic=True, **options)
         trainer = new_trainer(config, load_scene(config, progress=False))
         with torch.no_grad():
             trainer.model.raw["scales"] -= 1  # none is wider than the image
         losses = [float(trainer.step().loss) for _ in range(20)]  # more than EVERY: none by a pinhole
+        losses.append(evaluate(trainer.renderer, trainer.scene.train, "cpu", passes=1).metrics["ssim"])
         rendering = trainer.renderer(trainer.scene.train[0].camera)
         color, look = rendering.color.detach(), next(iter(trainer.passes.look(trainer.scene.train[:1])))
         assert len(rendering.radii) == len(look.costs) == trainer.num_gaussians
