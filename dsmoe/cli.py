@@ -339,10 +339,10 @@ def _with_lpips(net: str, device: str) -> Measure:
     except (BenchError, ImportError, ValueError) as error:
         raise TrainerError(f"--lpips {net}: {error}") from error
 
-    def measure(image: Any, target: Any, mask: Any = None) -> Dict[str, Optional[float]]:
+    def measure(image: Any, target: Any, mask: Any, padding: str) -> Dict[str, Optional[float]]:
         if mask is not None:
             raise TrainerError("--lpips: the scene has masks, and LPIPS of a part of an image is not defined")
-        return {**image_metrics(image, target), "lpips_" + net: distance(quantised(image), target)}
+        return {**image_metrics(image, target, None, padding), "lpips_" + net: distance(quantised(image), target)}
 
     return measure
 

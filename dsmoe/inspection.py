@@ -76,7 +76,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
         config, seconds = replace(config, iterations=opened.so_far.iteration), opened.so_far.seconds
     training = evaluate(renderer, scene.train, device, progress, psnr_alone, passes=1).metrics["psnr"]
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, training,
-                     renderer.background_gate)
+                     renderer.background_gate, earlier[0].get("protocol", {}).get("pinhole_every", 0) if earlier else 0)
     if earlier and "start" in earlier[0]:  # of `dsmoe simplify`
         row["start"] = earlier[0]["start"]
     if split == "test" and not is_other and not opened.so_far:

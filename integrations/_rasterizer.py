@@ -231,22 +231,29 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
 
 
 def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torch.Tensor]) -> Settings:
-    """Returns the settings with a camera that depends on theta and rho, at 0, to first order."""
-    if settings.rolling_shutter != "global":
-        raise NotImplementedError(f"rasterize: rolling_shutter is {settings.rolling_shutter!r}; theta and rho are "
-                                  "offered for 'global'")
-    view = settings.viewmatrix  # transposed
+    """Returns the settings with a camera that depends on theta and rho, at 0, to first order.
+
+    Of a rolling shutter they follow both poses, which are mixed linearly: so the pose of every row.
+    """
+    view, end = settings.viewmatrix, settings.viewmatrix_end  # transposed
     zero = view.new_zeros(3)
     x, y, z = (zero if theta is None else theta.reshape(3) - theta.reshape(3).detach()).unbind()
     nothing = torch.zeros_like(x)
     turn = torch.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing]).reshape(3, 3)  # turn @ v = theta x v
     step = torch.cat([turn.T, (zero if rho is None else rho.reshape(3) - rho.reshape(3).detach())[None]])  # transposed
-    moved = view + torch.cat([view[:, :3] @ step[:3] + view[:, 3:] * step[3:], view.new_zeros(4, 1)], 1)
+
+    def motion(pose: torch.Tensor) -> torch.Tensor:
+        return torch.cat([pose[:, :3] @ step[:3] + pose[:, 3:] * step[3:], view.new_zeros(4, 1)], 1)
+
+    moved = view + motion(view)
     projection = getattr(settings, "projmatrix_raw", None)
     if projection is None:  # what the product of both says
         projection = torch.linalg.solve(view, settings.projmatrix)
     centre = -moved[3, :3] @ torch.linalg.inv(moved[:3, :3])
-    return settings._replace(viewmatrix=moved, projmatrix=moved @ projection, campos=centre)
+    if end is not None:
+        end = end + motion(end)
+        centre = (centre - end[3, :3] @ torch.linalg.inv(end[:3, :3])) / 2
+    return settings._replace(viewmatrix=moved, viewmatrix_end=end, projmatrix=moved @ projection, campos=centre)
 
 
 def _median_depth(settings: Settings, inputs: Dict[str, Any], maps: GateMap) -> torch.Tensor:

@@ -19,14 +19,18 @@ from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import SceneError
 from dsmoe.inspection import open_trained
 from dsmoe.options.config import TrainConfig
+from dsmoe.results.evaluation import Evaluation, evaluate
+from dsmoe.results.rows import result_row
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.cameras import Camera
+from dsmoe.scenes.images import View
 from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.scenes.straight import EVERY, straightened
+from dsmoe.scenes.straight import EVERY, KEPT, StraightViews, _places, pinhole_every, straightened
 from dsmoe.system.files import ABANDONED, PART
+from dsmoe.train import PROGRESS_EVERY
 from dsmoe.training.trainer import Trainer
 
 WIDTH, HEIGHT = 96, 72
@@ -171,6 +175,8 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
     assert row["psnr"] > 25, "33.8 dB after 1000; as a pinhole it would not even show what lies beside the camera"
     assert main(["eval", output, "--device", "cpu"]) == 0
     assert f"{row['psnr']:.2f}" in capsys.readouterr().out
+    with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
+        assert json.load(file)[0]["protocol"]["pinhole_every"] == row["protocol"]["pinhole_every"] == EVERY
     assert main(["render", output, "--split", "test", "-o", str(tmp_path / "test"), "--device", "cpu"]) == 0
     shown, photograph = (np.asarray(Image.open(path).convert("RGB"), np.float64) for path in (
         next((tmp_path / "test").glob("**/0.png")), tmp_path / "scene" / "images" / "0.png"))
@@ -193,14 +199,35 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
 def test_a_training_through_a_lens_shows_pinhole_images_too(tmp_path):
     """Of so many steps one, by the pose of its photograph; else viewers would show haze that no view shows."""
     config = TrainConfig(scene=fisheye_scene(tmp_path), lenses="native", test_every=0, device="cpu", blend_mode="alpha",
-                         iterations=2 * EVERY + 1).validate()
+                         iterations=2 * EVERY).validate()
     trainer = Trainer(config, load_scene(config, progress=False))
     shown = [trainer.step().view.camera for _ in range(config.iterations)]
     pinholes = [camera for camera in shown if not camera.lens]
-    assert pinholes == [shown[EVERY - 1], shown[2 * EVERY - 1]]
+    assert pinholes == [shown[0], shown[EVERY]]
     poses = {f"{view.camera.name} (pinhole)": view.camera for view in trainer.scene.train}
     for camera in pinholes:
         assert (camera.center == poses[camera.name].center).all() and camera.fx == WIDTH / 2, "90 degrees across"
+    view = trainer.scene.train[0]
+    for interval in PROGRESS_EVERY.values():
+        samples = [trainer.straight.of(view, iteration) for iteration in range(interval, 20 * interval, interval)]
+        assert all(sample is view for sample in samples), "of the loss curve, which would show two kinds of images"
+    assert pinhole_every([view], 2) == EVERY and pinhole_every([view], 1) == 0, "the last step changes nothing"
+    assert pinhole_every([straight(view)], 2) == 0
+
+
+def test_maps_of_many_lenses_take_as_much_memory_as_is_told():
+    """Of more lenses than are kept; what is shown does not depend on what was kept."""
+    image = torch.randint(0, 256, (3, HEIGHT, WIDTH), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    views = [View(Camera(f"{index}", np.eye(3), np.zeros(3), FX + index, FY, CX, CY, WIDTH, HEIGHT,
+                         lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})), image) for index in range(KEPT + 2)]
+    many = StraightViews([view.camera for view in views])
+    for _ in range(2):
+        for view in views:
+            shown, alone = many.of(view, 1), straight(view)
+            assert (shown.image == alone.image).all() and (shown.mask == alone.mask).all()
+    grid, mask = _places(views[0].camera, views[0].camera.pinhole(), "cpu")
+    assert many._places.cache_info().currsize == KEPT
+    assert many.map_bytes == KEPT * (grid.nbytes + mask.nbytes) and StraightViews([]).map_bytes == 0
 
 
 def test_pinhole_images_keep_masks(tmp_path):
@@ -323,6 +350,8 @@ def test_panoramas_of_colmap(tmp_path):
     assert settings.camera_model == "equirectangular" and (settings.image_width, settings.image_height) == (64, 32)
     said = describe_scene(scene, layout, config)
     assert "EQUIRECTANGULAR stay as they are, since OpenCV cannot undistort them; Gaussians" in said
+    protocol = result_row(config, scene, 1, 0.0, Evaluation({}, None, []))["protocol"]
+    assert protocol["ssim"].endswith("go across their seam") and "pinhole_every" not in protocol
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
@@ -333,12 +362,12 @@ def test_a_panorama_has_no_seam(tmp_path, mode):
         image = Image.fromarray(np.roll(photograph, 32 * turned, 1))
         folder = write_scene(tmp_path / str(turned), "EQUIRECTANGULAR", [64, 32], image, 1, (64, 32), turned)
         options = dict(blend_mode=mode, background_gate=0.0) if mode == "smoe" else dict(blend_mode=mode)
-        config = TrainConfig(scene=folder, iterations=20, test_every=0, device="cpu", lambda_dssim=0.0,  # by windows,
-                             deterministic=True, **options)  # which do not go across the seam
+        config = TrainConfig(scene=folder, iterations=20, test_every=0, device="cpu", deterministic=True, **options)
         trainer = new_trainer(config, load_scene(config, progress=False))
         with torch.no_grad():
             trainer.model.raw["scales"] -= 1  # none is wider than the image
         losses = [float(trainer.step().loss) for _ in range(20)]  # more than EVERY: none by a pinhole
+        losses.append(evaluate(trainer.renderer, trainer.scene.train, "cpu", passes=1).metrics["ssim"])
         rendering = trainer.renderer(trainer.scene.train[0].camera)
         color, look = rendering.color.detach(), next(iter(trainer.passes.look(trainer.scene.train[:1])))
         assert len(rendering.radii) == len(look.costs) == trainer.num_gaussians
