@@ -301,10 +301,12 @@ def scaled_gradient(factors: torch.Tensor, tensor: Any) -> Any:
 def visible_filter(self, means3D, scales=None, rotations=None, cov3D_precomp=None):
     """Returns the radii [N] int32 that a rendering would have, 0 for what the view does not see: a rasterizer's method.
 
-    means3D: [N, 3]; scales [N, 3] with rotations [N, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]` are
-    taken as they are. Which radii are 0 depends on the blend mode: the anchors need the mode of their rendering.
+    means3D: [N, 3]; scales [N, 3] with rotations [N or more, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]`
+    are taken as they are. Which radii are 0 depends on the blend mode: the anchors need the mode of their rendering.
     Raises ValueError or TypeError if arguments do not fit, as `rasterize` does.
     """
+    if rotations is not None:  # HAC++'s decoder makes fewer anchors, and leaves the rotations, all of them the identity
+        rotations = rotations[:len(means3D)]
     return visible_radii(means3D, as_ours(self.raster_settings, {})[0], scales, rotations, cov3D_precomp)
 
 
