@@ -15,8 +15,8 @@ import torch
 from .cameras import Camera
 from .images import View
 
-EVERY = 16  # of so many views through lenses, one is shown by a pinhole; even
-KEPT = 4  # maps of places, by lens. With more lenses they are made anew: on a CPU 0.3 s at 800x533, of 16 steps
+EVERY = 8  # of so many views through lenses, one is shown by a pinhole; even
+KEPT = 4  # maps of places, by lens. With more lenses they are made anew: on a CPU 0.3 s at 800x533, in 8 steps
 MAP_BYTES = 9  # of a map, for each pixel
 
 Map = Tuple[torch.Tensor, torch.Tensor]
