@@ -28,7 +28,7 @@ from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.scenes.straight import EVERY, KEPT, StraightViews, _places, pinhole_every, straightened
+from dsmoe.scenes.straight import EVERY, StraightViews, _places, pinhole_every, straightened
 from dsmoe.system.files import ABANDONED, PART
 from dsmoe.train import PROGRESS_EVERY
 from dsmoe.training.trainer import Trainer
@@ -230,19 +230,24 @@ def test_a_training_through_a_lens_shows_pinhole_images_too(tmp_path):
     assert pinhole_every([straight(view)], 2) == 0
 
 
-def test_maps_of_many_lenses_take_as_much_memory_as_is_told():
-    """Of more lenses than are kept; what is shown does not depend on what was kept."""
-    image = torch.randint(0, 256, (3, HEIGHT, WIDTH), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+@pytest.mark.parametrize("most", [0, 2, 4, 9])
+def test_pinhole_images_take_no_more_memory_than_is_told(monkeypatch, most):
+    """Of four lenses, with room for so many images; what is shown does not depend on what was kept."""
+    monkeypatch.setattr("dsmoe.scenes.straight.KEPT_BYTES", most * 5 * WIDTH * HEIGHT + 1)
+    planes = torch.randint(0, 256, (4, HEIGHT, WIDTH), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     views = [View(Camera(f"{index}", np.eye(3), np.zeros(3), FX + index, FY, CX, CY, WIDTH, HEIGHT,
-                         lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})), image) for index in range(KEPT + 2)]
-    many = StraightViews([view.camera for view in views])
-    for _ in range(2):
-        for view in views:
-            shown, alone = many.of(view, 1), straight(view)
-            assert (shown.image == alone.image).all() and (shown.mask == alone.mask).all()
-    grid, mask = _places(views[0].camera, views[0].camera.pinhole(), "cpu")
-    assert many._places.cache_info().currsize == KEPT
-    assert many.map_bytes == KEPT * (grid.nbytes + mask.nbytes) and StraightViews([]).map_bytes == 0
+                         lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})), planes[:3], planes[3:]) for index in range(4)]
+    many, kept = StraightViews(views), []
+    for view in [*views, *views]:
+        shown, alone = many.of(view, 1), straight(view)
+        for name in ("image", "opacity", "mask"):
+            assert torch.equal(getattr(shown, name), getattr(alone, name))
+        kept.append(shown)
+    again = sum(one is other for one, other in zip(kept[:4], kept[4:]))
+    assert again == (4 if most >= 4 else 0), "the oldest goes first"
+    held = sum(tensor.nbytes for view in kept[:min(most, 4)] for tensor in (view.image, view.opacity, view.mask))
+    assert many.most_bytes == held + sum(tensor.nbytes for tensor in _places(view.camera, view.camera.pinhole(), "cpu"))
+    assert StraightViews([]).most_bytes == 0
 
 
 def test_pinhole_images_keep_masks(tmp_path):
