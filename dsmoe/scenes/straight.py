@@ -95,7 +95,8 @@ class StraightViews:
     def of(self, view: View, iteration: int) -> View:
         """What the training shows in this iteration: the view, or in each so many one, what a pinhole camera sees.
 
-        These iterations are odd, since the loss curve takes every 10th or 100th, and not among the last ones.
+        These iterations are odd, since the loss curve takes every 10th or 100th (of a batch it takes the mean), and not
+        among the last ones.
         """
         name = view.camera.name
         return self._made(name) if iteration % EVERY == 1 and name in self._bent else view
