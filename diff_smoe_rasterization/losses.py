@@ -93,7 +93,7 @@ def _loss(with_gradient: bool, image: torch.Tensor, target: torch.Tensor, l1_wei
     if with_gradient:  # each column adds up what came to its copies
         width, zeros = image.shape[-1], -_WINDOW_RADIUS % image.shape[-1]
         by_columns = torch.nn.functional.pad(by_larger[..., _WINDOW_RADIUS:-_WINDOW_RADIUS, :], (zeros, zeros))
-        gradient = gradient + by_columns.unflatten(-1, (-1, width)).sum(-2)
+        gradient = gradient + by_columns.reshape(*image.shape[:-1], -1, width).sum(-2)
     return loss + similarity, gradient
 
 

@@ -15,9 +15,9 @@ import torch
 from .cameras import Camera
 from .images import View
 
-EVERY = 16  # of so many views through lenses, one is shown by a pinhole; even
-KEPT = 4  # maps of places, by lens. With more lenses they are made anew: on a CPU 0.3 s at 800x533, of 16 steps
-MAP_BYTES = 9  # of a map, for each pixel
+EVERY = 8  # of so many views through lenses, one is shown by a pinhole; even
+KEPT_BYTES = 2**30  # of pinhole images at most; what is more is made anew each time
+VIEW_BYTES, MAP_BYTES = 5, 9  # for each pixel: colours, opacity and mask; a place on the bent image, and whether it is
 
 Map = Tuple[torch.Tensor, torch.Tensor]
 
@@ -71,12 +71,16 @@ def straightened(view: View, camera: Camera, places: Callable[[Camera, Camera, s
 
 
 class StraightViews:
-    """The pinhole images of views through lenses; they are made anew each time, as they would take as much memory."""
+    """The pinhole images of views through lenses. They are made where they are first shown, and kept as far as told."""
 
-    def __init__(self, cameras: Sequence[Camera]) -> None:
-        self._straight = {camera.name: dataclasses.replace(camera.pinhole(), name=f"{camera.name} (pinhole)")
-                          for camera in cameras if _is_bent(camera)}
-        self._places = functools.lru_cache(maxsize=KEPT)(_places)
+    def __init__(self, views: Sequence[View]) -> None:
+        self._bent = {view.camera.name: view for view in views if _is_bent(view.camera)}
+        self._straight = {name: dataclasses.replace(view.camera.pinhole(), name=f"{name} (pinhole)")
+                          for name, view in self._bent.items()}
+        self._pixels = max((camera.width * camera.height for camera in self.cameras), default=0)
+        self._most = min(len(self._bent), KEPT_BYTES // max(1, VIEW_BYTES * self._pixels))
+        self._made = functools.lru_cache(maxsize=self._most)(self._make)
+        self._places = functools.lru_cache(maxsize=1)(_places)  # most scenes have one lens
 
     @property
     def cameras(self) -> List[Camera]:
@@ -84,14 +88,18 @@ class StraightViews:
         return [*self._straight.values()]
 
     @property
-    def map_bytes(self) -> int:
-        """Of memory, which the kept maps take at most."""
-        return KEPT * MAP_BYTES * max((camera.width * camera.height for camera in self.cameras), default=0)
+    def most_bytes(self) -> int:
+        """Of memory, which the kept images, and where their pixels lie, take at most."""
+        return (self._most * VIEW_BYTES + MAP_BYTES) * self._pixels
 
     def of(self, view: View, iteration: int) -> View:
         """What the training shows in this iteration: the view, or in each so many one, what a pinhole camera sees.
 
-        These iterations are odd, since the loss curve takes every 10th or 100th, and not among the last ones.
+        These iterations are odd, since the loss curve takes every 10th or 100th (of a batch it takes the mean), and not
+        among the last ones.
         """
-        camera = self._straight.get(view.camera.name)
-        return view if camera is None or iteration % EVERY != 1 else straightened(view, camera, self._places)
+        name = view.camera.name
+        return self._made(name) if iteration % EVERY == 1 and name in self._bent else view
+
+    def _make(self, name: str) -> View:
+        return straightened(self._bent[name], self._straight[name], self._places)

@@ -25,7 +25,7 @@ def gaussian_bytes(config: TrainConfig) -> int:
 def free_bytes(pixels: int, kept: int = 0) -> int:
     """How much of this process's GPU is left for Gaussians, where images have so many pixels.
 
-    kept: bytes of what a training will keep beside them.
+    kept: bytes of what a training will make and keep beside them.
     """
     cached = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()  # by torch, for later
     return max(0, torch.cuda.mem_get_info()[0] + cached - PIXEL_BYTES * pixels - kept)

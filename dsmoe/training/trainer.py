@@ -60,7 +60,7 @@ class Trainer:
             background_gate=self.gate.value if self.gate else float(config.background_gate),
             faint_below=config.faint_below, deterministic=config.deterministic)
         cameras = [view.camera for view in self.scene.train]
-        self.straight = StraightViews(cameras)
+        self.straight = StraightViews(self.scene.train)
         self.renderer.prepare([*cameras, *self.straight.cameras])
         self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
@@ -112,7 +112,7 @@ class Trainer:
         if self.config.device == "cpu":
             return None
         pixels = max(view.camera.width * view.camera.height for view in self.scene.train)
-        here = free_bytes(pixels, self.straight.map_bytes)
+        here = free_bytes(pixels, self.straight.most_bytes)
         free = [numbers[0] for numbers in self.group.gather_numbers([here], self.config.device)]
         return self.num_gaussians + self.group.size * min(free) // gaussian_bytes(self.config)
 
