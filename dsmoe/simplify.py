@@ -112,7 +112,7 @@ def _budget(start: Start, budget: Optional[int], keep: Optional[float]) -> int:
         raise ConfigError(f"--budget is {number}; it must be at least {LEAST}")
     if number > start.count:
         raise ConfigError(f"--budget is {number}; it must be at most {start.count}, which {start.path} has: to grow "
-                          f"it, `dsmoe train SCENE --init {start.path}`")
+                          f"it, `dsmoe train SCENE --init {shlex.quote(start.path)}`")
     return number
 
 

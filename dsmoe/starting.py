@@ -131,9 +131,11 @@ def _read_start(path: str, *_: int) -> Start:
     gaussians = read_gaussians(path)
     count = len(gaussians.means3D)
     bad = count - int(finite_rows(raw_of(gaussians)).sum())
-    if bad or not count:
-        what = f"{bad:,} of its {count:,} Gaussians have a number that is NaN or infinite" if bad else "it is empty"
-        raise TrainerError(f"{path}: {what}; `dsmoe export MODEL -o clean.glb` leaves such Gaussians out")
+    if not count:
+        raise TrainerError(f"{path}: it holds no Gaussian")
+    if bad:
+        raise TrainerError(f"{path}: {bad:,} of its {count:,} Gaussians have a number that is NaN or infinite; `dsmoe "
+                           f"export {shlex.quote(path)} -o clean.glb` leaves such Gaussians out")
     recorded = recorded_of(path, gaussians)
     gaussians = dataclasses.replace(gaussians, blend_mode=recorded.blend_mode)  # or of its folder
     if recorded.blend_mode is None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 
 from ..errors import ConfigError, SceneError, TrainerError
 from ..system.files import check_output, is_file, is_folder
@@ -54,7 +55,7 @@ def _check_run(folder: str) -> None:
     """Raises ConfigError if it is not the output folder of a training; the error says what renders another model."""
     if is_file(folder) or is_folder(os.path.join(folder, "point_cloud")) and not holds_run(folder):
         raise ConfigError(f"{folder} is not the output folder of `dsmoe train`, whose scene and options eval takes; "
-                          f"`dsmoe render {folder} --scene SCENE -o IMAGES` renders such a model")
+                          f"`dsmoe render {shlex.quote(folder)} --scene SCENE -o IMAGES` renders such a model")
     TrainConfig.load(folder)
 
 

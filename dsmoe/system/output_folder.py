@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shlex
 from contextlib import contextmanager
 from typing import IO, Collection, Iterator, List, NamedTuple, Optional
 
@@ -86,8 +87,8 @@ def check_there(folder: str, lock: IO[str]) -> None:
         now = ""
     if os.path.isfile(now):
         now = os.path.dirname(now)
-        raise TrainerError(f"{folder} has been moved to {now} during the training; `dsmoe train --resume -o {now}` "
-                           "continues from its last checkpoint there")
+        raise TrainerError(f"{folder} has been moved to {now} during the training; `dsmoe train --resume -o "
+                           f"{shlex.quote(now)}` continues from its last checkpoint there")
     raise TrainerError(f"{folder} has been removed during the training; what is not saved is lost")
 
 
