@@ -133,8 +133,8 @@ def _read_start(path: str, *_: int) -> Start:
     if not count:
         raise TrainerError(f"{path}: it holds no Gaussians; name a model that has some")
     if bad:
-        raise TrainerError(f"{path}: {bad:,} of its {count:,} Gaussians have a number that is NaN or infinite; "
-                           "`dsmoe export MODEL -o clean.glb` leaves such Gaussians out")
+        raise TrainerError(f"{path}: {bad:,} of its {count:,} Gaussians have a number that is NaN or infinite; `dsmoe "
+                           f"export {shlex.quote(path)} -o clean.glb` leaves such Gaussians out")
     recorded = recorded_of(path, gaussians)
     gaussians = dataclasses.replace(gaussians, blend_mode=recorded.blend_mode)  # or of its folder
     mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")

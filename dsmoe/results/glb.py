@@ -21,6 +21,9 @@ is not as usual. It is required, so that a viewer that does not know it refuses 
 
 POINTS, VERTICES = 0, 34962  # of glTF: a primitive's mode, a buffer view's target
 FLOAT, UNSIGNED_SHORT = 5126, 5123  # component types
+SRGB = "srgb_rec709_display"
+UNMOVED = {"matrix": np.eye(4).ravel().tolist(), "translation": [0, 0, 0], "rotation": [0, 0, 0, 1],
+           "scale": [1, 1, 1]}  # what nodes have that move nothing
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 LARGEST = 2**32 - 1  # bytes of a .glb, whose length has 32 bits
 
@@ -37,12 +40,10 @@ def glb_bytes(gaussians: Gaussians, blend: Optional[Blend]) -> bytes:
     """The file's content, in the axes of glTF (y up). blend: None for alpha.
 
     Left out are Gaussians that are not finite, and those whose quaternion is 0. Raises TrainerError if none is left,
-    as glTF has no empty arrays, and if they are too many.
+    and if they are too many.
     """
     attributes = _attributes(gaussians, fallback=blend is None)
     count = len(attributes["POSITION"])
-    if not count:
-        raise TrainerError("a .glb holds one Gaussian at least, but the model has none that can be shown")
     document, offset = _document(blend), 0
     for index, (name, array) in enumerate(attributes.items()):
         document["bufferViews"].append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes,
@@ -65,7 +66,7 @@ def glb_bytes(gaussians: Gaussians, blend: Optional[Blend]) -> bytes:
 
 
 def glb_gaussians(content: bytes) -> Gaussians:
-    """What a file holds: the first primitive of Gaussians, in float32. Raises ValueError if there is none."""
+    """What a file holds: one primitive of Gaussians, in float32, where it lies. Raises ValueError for another."""
     header = struct.Struct("<4s2II4s")
     if len(content) < header.size:
         raise ValueError(f"not a .glb of Gaussians: it has {len(content)} bytes, of {header.size} at least")
@@ -81,6 +82,7 @@ def glb_gaussians(content: bytes) -> Gaussians:
                       if SPLATTING in primitive.get("extensions", {})]
         if not primitives:
             raise ValueError(f"it holds no Gaussians of {SPLATTING}")
+        _refuse_what_is_not_read(document, primitives)
         blend = primitives[0]["extensions"][SPLATTING].get("extensions", {}).get(BLEND, {})
         arrays = {name: _read(document, binary, index) for name, index in primitives[0]["attributes"].items()
                   if name != "COLOR_0"}
@@ -105,6 +107,29 @@ def glb_gaussians(content: bytes) -> Gaussians:
     except (IndexError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"not a .glb of Gaussians ({error})") from error
     return y_up(gaussians)
+
+
+def _refuse_what_is_not_read(document: Dict[str, Any], primitives: List[Dict[str, Any]]) -> None:
+    """Raises ValueError if the Gaussians would be other ones, or in another place, than viewers show them."""
+    if len(primitives) > 1:
+        raise ValueError(f"it holds {len(primitives)} clouds of Gaussians; only a file of one is read")
+    space = primitives[0]["extensions"][SPLATTING].get("colorSpace", SRGB)
+    if space != SRGB:
+        raise ValueError(f"its Gaussians have the colour space {space!r}; only {SRGB} is read")
+    nodes = document.get("nodes", [])
+    above = {child: place for place, node in enumerate(nodes) for child in node.get("children", [])}
+    for place, node in enumerate(nodes):
+        mesh = document["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
+        if primitives[0] not in mesh["primitives"]:
+            continue
+        seen = set()
+        while place is not None and place not in seen:
+            seen.add(place)
+            for name, identity in UNMOVED.items():
+                if nodes[place].get(name, identity) != identity:
+                    raise ValueError(f"its node {place} moves the Gaussians by a {name}, which is not read; write it "
+                                     "without")
+            place = above.get(place)
 
 
 def _json(text: bytes) -> Any:
@@ -141,7 +166,7 @@ def _check_shapes(arrays: Dict[str, np.ndarray]) -> None:
 
 def _document(blend: Optional[Blend]) -> Dict[str, Any]:
     """The JSON without what depends on the arrays."""
-    splatting: Dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    splatting: Dict[str, Any] = {"kernel": "ellipse", "colorSpace": SRGB}
     document: Dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"diff_smoe_rasterization {__version__}"},
         "extensionsUsed": [SPLATTING],

@@ -9,6 +9,7 @@ import torch
 
 from diff_smoe_rasterization.io import Gaussians
 
+from ..errors import TrainerError
 from ..model import finite_rows as are_finite
 
 # What half a turn about x makes of x, y, z, and of the real spherical harmonics of degrees 1 to 3 (y, z, x; xy, ...).
@@ -48,9 +49,14 @@ def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
 
 
 def rotatable_rows(gaussians: Gaussians) -> List[np.ndarray]:
-    """`finite_rows` without those whose quaternion is 0, which viewers cannot turn into a rotation."""
+    """`finite_rows` without those whose quaternion is 0, which viewers cannot turn into a rotation.
+
+    Raises TrainerError if none is left.
+    """
     rows = finite_rows(gaussians)
     turned = rows[3].any(axis=1)
+    if not turned.any():
+        raise TrainerError("the model has no Gaussian that can be shown; a .splat, .spz or .glb holds one at least")
     return [array[turned] for array in rows]
 
 

@@ -202,17 +202,57 @@ def test_smoe_with_the_gate_of_alpha_is_alpha(export, capsys):
     assert document["extensionsUsed"] == [KHR] and "note:" not in capsys.readouterr().out
 
 
-def test_a_glb_leaves_out_what_no_viewer_can_show_and_is_never_empty(export, tmp_path, capsys):
+def test_a_glb_leaves_out_what_no_viewer_can_show(export):
     positions, rotations = cloud().means3D.copy(), cloud().rotations.copy()
     positions[0, 1], rotations[1] = np.nan, 0
     _, arrays = read_glb(export(cloud(means3D=positions, rotations=rotations), "model.glb").read_bytes())
     assert {len(array) for array in arrays.values()} == {COUNT - 2}
     assert np.array_equal(arrays["POSITION"][0], positions[2] * [1, -1, -1])
-    nothing = str(tmp_path / "nothing.ply")
+
+
+@pytest.mark.parametrize("ending", ["splat", "spz", "glb"])
+def test_a_model_that_shows_nothing_is_refused(tmp_path, monkeypatch, capsys, ending):
+    monkeypatch.setitem(sys.modules, "gsply", SimpleNamespace())
+    nothing, path = str(tmp_path / "nothing.ply"), tmp_path / f"nothing.{ending}"
     io.write_gaussians(nothing, cloud(rotations=np.zeros((COUNT, 4))))
-    assert main(["export", nothing, "-o", str(tmp_path / "nothing.glb")]) == 1
-    assert "a .glb holds one Gaussian at least" in capsys.readouterr().err
-    assert not (tmp_path / "nothing.glb").exists()
+    assert main(["export", nothing, "-o", str(path)]) == 1
+    assert capsys.readouterr().err == ("dsmoe export: error: the model has no Gaussian that can be shown; a .splat, "
+                                       ".spz or .glb holds one at least\n")
+    assert not path.exists()
+
+
+def with_document(path, change):
+    """Changes the JSON of a .glb."""
+    content = path.read_bytes()
+    length, = struct.unpack_from("<I", content, 12)
+    document = json.loads(content[20:20 + length])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length:]
+    path.write_bytes(struct.pack("<4sII I4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest)
+
+
+@pytest.mark.parametrize("change, words", [
+    (lambda d: d["nodes"][0].update(rotation=[0.7071, 0, 0, 0.7071]), "its node 0 moves the Gaussians by a rotation"),
+    (lambda d: d.update(nodes=[{"mesh": 0}, {"children": [0], "scale": [2, 2, 2]}]), "its node 1 moves the Gaussians"),
+    (lambda d: d["meshes"].append(d["meshes"][0]), "it holds 2 clouds of Gaussians; only a file of one is read"),
+    (lambda d: d["meshes"][0]["primitives"][0]["extensions"][KHR].update(colorSpace="lin_rec709_display"),
+     "the colour space 'lin_rec709_display'; only srgb_rec709_display is read")])
+def test_a_glb_that_viewers_show_otherwise_is_refused(export, tmp_path, capsys, change, words):
+    path = export(cloud(), "model.glb")
+    with_document(path, change)
+    assert main(["export", str(path), "-o", str(tmp_path / "copy.ply")]) == 1
+    assert words in capsys.readouterr().err
+
+
+def test_nodes_that_do_not_move_the_gaussians_change_nothing(export, tmp_path):
+    path = export(cloud(), "model.glb")
+    with_document(path, lambda d: d.update(nodes=[
+        {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
+        {"camera": 0, "translation": [1, 2, 3]}, {"children": [0, 1], "scale": [1, 1, 1]}]))
+    assert main(["export", str(path), "-o", str(tmp_path / "copy.ply")]) == 0
+    assert np.array_equal(io.read_gaussians(str(tmp_path / "copy.ply")).means3D, cloud().means3D)
 
 
 def test_pygltflib_reads_a_glb(export):

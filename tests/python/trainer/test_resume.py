@@ -445,7 +445,7 @@ def test_what_an_overwriting_run_leaves_that_is_killed_as_it_begins_is_not_gone_
 
 @pytest.mark.parametrize("moved", [True, False])
 def test_a_folder_that_goes_during_the_training_ends_it(tiny_config, tmp_path, monkeypatch, moved):
-    config, new, step = dataclasses.replace(tiny_config, checkpoint_every=2), str(tmp_path / "new"), Trainer.step
+    config, new, step = dataclasses.replace(tiny_config, checkpoint_every=2), str(tmp_path / "a new"), Trainer.step
 
     def step_without_folder(self, *arguments):
         if self.iteration == 2:
@@ -456,7 +456,7 @@ def test_a_folder_that_goes_during_the_training_ends_it(tiny_config, tmp_path, m
         return step(self, *arguments)
 
     monkeypatch.setattr(Trainer, "step", step_without_folder)
-    words = f"out has been moved to {new} .* --resume -o {new}" if moved else "out has been removed"
+    words = f"out has been moved to {new} .* --resume -o '{new}'" if moved else "out has been removed"
     with pytest.raises(TrainerError, match=words):
         train(config, progress=False)
     assert not os.path.isdir(config.output) or not os.listdir(config.output)

@@ -448,7 +448,7 @@ def test_bad_input_is_told_and_nothing_is_written(run, tmp_path, options, words)
 
 
 def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
-    output, ply = str(tmp_path / "out"), str(tmp_path / "model.ply")
+    output, ply = str(tmp_path / "out"), str(tmp_path / "my model.ply")
     stored = io.read_gaussians(ply_of(run))
 
     def fails(model, *words):
@@ -465,8 +465,14 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
     logits = stored.opacity_logits.copy()
     logits[0], logits[4] = np.nan, np.inf
     io.write_gaussians(ply, dataclasses.replace(stored, opacity_logits=logits))
-    assert (f"2 of its {len(logits):,} Gaussians have a number that is NaN or infinite; `dsmoe export MODEL -o "
+    assert (f"2 of its {len(logits):,} Gaussians have a number that is NaN or infinite; `dsmoe export '{ply}' -o "
             "clean.glb`") in fails(ply, *scene)
+    arrays = ("means3D", "dc", "shs", "opacity_logits", "log_scales", "rotations")
+    io.write_gaussians(ply, dataclasses.replace(stored, **{name: getattr(stored, name)[:0] for name in arrays}))
+    assert "my model.ply: it holds no Gaussian\n" in fails(ply, *scene)
+    io.write_gaussians(ply, stored)
+    assert main(["simplify", ply, *scene, "--budget", "100000", "-o", output, "--device", "cpu"]) == 1
+    assert f"--init '{ply}'`" in capsys.readouterr().err
     io.write_gaussians(ply, dataclasses.replace(stored, means3D=stored.means3D[:, [1, 2, 0]]))
     said = fails(ply, *scene)
     assert "does not show" in said and "at least 15. Is it another scene, are its poses" in said
