@@ -469,7 +469,7 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
             "clean.glb`") in fails(ply, *scene)
     arrays = ("means3D", "dc", "shs", "opacity_logits", "log_scales", "rotations")
     io.write_gaussians(ply, dataclasses.replace(stored, **{name: getattr(stored, name)[:0] for name in arrays}))
-    assert "my model.ply: it holds no Gaussian\n" in fails(ply, *scene)
+    assert "my model.ply: it holds no Gaussians; name a model that has some\n" in fails(ply, *scene)
     io.write_gaussians(ply, stored)
     assert main(["simplify", ply, *scene, "--budget", "100000", "-o", output, "--device", "cpu"]) == 1
     assert f"--init '{ply}'`" in capsys.readouterr().err
