@@ -170,8 +170,9 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
     refuse_transforms("blend_footprints", tensors)
     shape = list(footprints.features.shape)
     columns = settings.bg.numel() + sum(name in outputs for name in FEATURE_OUTPUTS)
-    if len(shape) == 2 and shape[1] > columns:  # the op may take such rows, and leave out what they are filled up with
-        raise ValueError(f"blend_footprints: features has shape {shape}; it must be {[shape[0], columns]}")
+    if len(shape) == 2 and shape[1] != columns:  # the op would take rows that are filled up
+        raise ValueError(f"blend_footprints: features has shape {shape}; it must be {[shape[0], columns]}, by the "
+                         "background and the outputs, which both halves take")
     if _wants_gradient(tensors):
         images = _Blend.apply((*options, True), *tensors)
     else:

@@ -277,5 +277,5 @@ def test_footprints_that_do_not_fit_are_refused(change, error, text):
 
 def test_depth_needs_footprints_that_have_it():
     scene = random_scene("alpha")
-    with pytest.raises(ValueError, match=r"features has shape \[120, 3\]; it must be \[120, 4\]"):
+    with pytest.raises(ValueError, match=r"\[120, 3\]; it must be \[120, 4\], by the .* outputs, which both"):
         blend_footprints(project_gaussians(settings=scene.settings, **scene.inputs), scene.settings, ("depth",))
