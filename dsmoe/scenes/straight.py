@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Callable, List, Sequence, Tuple
+from typing import Callable, Dict, List, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from .cameras import Camera
 from .images import View
 
 EVERY = 8  # of so many views through lenses, one is shown by a pinhole; even
-KEPT_BYTES = 2**30  # of pinhole images at most; what is more is made anew each time
+KEPT_BYTES = 2**30  # of pinhole images, at most
 VIEW_BYTES, MAP_BYTES = 5, 9  # for each pixel: colours, opacity and mask; a place on the bent image, and whether it is
 
 Map = Tuple[torch.Tensor, torch.Tensor]
@@ -71,35 +71,42 @@ def straightened(view: View, camera: Camera, places: Callable[[Camera, Camera, s
 
 
 class StraightViews:
-    """The pinhole images of views through lenses. They are made where they are first shown, and kept as far as told."""
+    """The pinhole images of views through lenses, each made when it is first shown.
+
+    The first ones stay in memory, as many as KEPT_BYTES hold; others are made anew each time.
+    """
 
     def __init__(self, views: Sequence[View]) -> None:
-        self._bent = {view.camera.name: view for view in views if _is_bent(view.camera)}
-        self._straight = {name: dataclasses.replace(view.camera.pinhole(), name=f"{name} (pinhole)")
-                          for name, view in self._bent.items()}
+        bent = [view.camera for view in views if _is_bent(view.camera)]
+        self._cameras = {camera.name: dataclasses.replace(camera.pinhole(), name=f"{camera.name} (pinhole)")
+                         for camera in bent}
         self._pixels = max((camera.width * camera.height for camera in self.cameras), default=0)
-        self._most = min(len(self._bent), KEPT_BYTES // max(1, VIEW_BYTES * self._pixels))
-        self._made = functools.lru_cache(maxsize=self._most)(self._make)
+        self._most = min(len(self._cameras), KEPT_BYTES // max(1, VIEW_BYTES * self._pixels))
+        self._kept: Dict[str, View] = {}
         self._places = functools.lru_cache(maxsize=1)(_places)  # most scenes have one lens
 
     @property
     def cameras(self) -> List[Camera]:
         """All that `of` may give."""
-        return [*self._straight.values()]
+        return [*self._cameras.values()]
 
     @property
     def most_bytes(self) -> int:
-        """Of memory, which the kept images, and where their pixels lie, take at most."""
+        """At most so many bytes stay in use: for the kept images, and for where the pixels of one lie."""
         return (self._most * VIEW_BYTES + MAP_BYTES) * self._pixels
 
     def of(self, view: View, iteration: int) -> View:
-        """What the training shows in this iteration: the view, or in each so many one, what a pinhole camera sees.
+        """What the training shows in this iteration: the view, or in 1, 1 + EVERY and so on its pinhole image.
 
-        These iterations are odd, since the loss curve takes every 10th or 100th (of a batch it takes the mean), and not
-        among the last ones.
+        EVERY is even, so these iterations are odd. The loss curve takes every 10th or 100th iteration, and so shows
+        only photographs, but for its end; of a batch it takes the mean.
         """
         name = view.camera.name
-        return self._made(name) if iteration % EVERY == 1 and name in self._bent else view
-
-    def _make(self, name: str) -> View:
-        return straightened(self._bent[name], self._straight[name], self._places)
+        if iteration % EVERY != 1 or name not in self._cameras:
+            return view
+        if name in self._kept:
+            return self._kept[name]
+        made = straightened(view, self._cameras[name], self._places)
+        if len(self._kept) < self._most:
+            self._kept[name] = made
+        return made

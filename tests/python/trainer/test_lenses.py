@@ -1,11 +1,13 @@
 """Distorted images are loaded as those of a pinhole camera: every model against its formula, masks, and the cache."""
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
 import shutil
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -244,21 +246,40 @@ def test_a_training_through_a_lens_shows_pinhole_images_too(tmp_path):
     assert pinhole_every([straight(view)], 2) == 0
 
 
+def views_of_lenses(count):
+    """One through each of so many lenses."""
+    planes = torch.randint(0, 256, (4, HEIGHT, WIDTH), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    return [View(Camera(f"{index}", np.eye(3), np.zeros(3), FX + index, FY, CX, CY, WIDTH, HEIGHT,
+                        lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})), planes[:3], planes[3:])
+            for index in range(count)]
+
+
+def test_pinhole_images_are_freed_at_once():
+    """Up to 1 GiB of a GPU's memory would otherwise wait for the garbage collector."""
+    view, = views_of_lenses(1)
+    many = StraightViews([view])
+    made = weakref.ref(many.of(view, 1))
+    assert made() is many.of(view, 1), "it is kept"
+    gc.disable()
+    try:
+        del many
+        assert made() is None
+    finally:
+        gc.enable()
+
+
 @pytest.mark.parametrize("most", [0, 2, 4, 9])
 def test_pinhole_images_take_no_more_memory_than_is_told(monkeypatch, most):
     """Of four lenses, with room for so many images; what is shown does not depend on what was kept."""
     monkeypatch.setattr("dsmoe.scenes.straight.KEPT_BYTES", most * 5 * WIDTH * HEIGHT + 1)
-    planes = torch.randint(0, 256, (4, HEIGHT, WIDTH), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
-    views = [View(Camera(f"{index}", np.eye(3), np.zeros(3), FX + index, FY, CX, CY, WIDTH, HEIGHT,
-                         lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})), planes[:3], planes[3:]) for index in range(4)]
+    views = views_of_lenses(4)
     many, kept = StraightViews(views), []
     for view in [*views, *views]:
         shown, alone = many.of(view, 1), straight(view)
         for name in ("image", "opacity", "mask"):
             assert torch.equal(getattr(shown, name), getattr(alone, name))
         kept.append(shown)
-    again = sum(one is other for one, other in zip(kept[:4], kept[4:]))
-    assert again == (4 if most >= 4 else 0), "the oldest goes first"
+    assert [one is other for one, other in zip(kept[:4], kept[4:])] == [index < most for index in range(4)]
     held = sum(tensor.nbytes for view in kept[:min(most, 4)] for tensor in (view.image, view.opacity, view.mask))
     assert many.most_bytes == held + sum(tensor.nbytes for tensor in _places(view.camera, view.camera.pinhole(), "cpu"))
     assert StraightViews([]).most_bytes == 0
