@@ -186,14 +186,13 @@ def table_1() -> str:
     return table(["bonsai", "sparse: PSNR", *columns, "dense: PSNR", *columns], lines)
 
 
-def plugged(trainers: Sequence[str], density: str) -> Tuple[str, str]:
+def plugged(trainers: Sequence[str], density: str) -> Tuple[List[float], List[float]]:
     """Public trainers on bonsai and fox, patched, less their own rasterizer: dB, and per cent of Gaussians saved."""
     cells = grouped(rows_of("trainers_tails_h100.jsonl") + rows_of("trainers_tails_h200.jsonl"),
                     "trainer", "density", "scene", "blend_mode")
     pairs = [[cells[trainer, density, scene, blend] for blend in BLENDS]
              for trainer in trainers for scene in ("bonsai", "fox")]
-    return (f"{span((less(smoe, alpha, 'psnr') for alpha, smoe in pairs), 1, '+')} dB",
-            f"{span(abs(round(fewer(smoe, alpha))) for alpha, smoe in pairs)} % fewer")
+    return [less(smoe, alpha, "psnr") for alpha, smoe in pairs], [fewer(smoe, alpha) for alpha, smoe in pairs]
 
 
 def plugged_2024() -> List[Tuple[List[Row], List[Row]]]:
@@ -433,8 +432,10 @@ def fast_runs(blend: str) -> List[Row]:
 
 
 def span(values: Iterable[float], digits: int = 0, sign: str = "") -> str:
+    """The least and the largest as "1 to 3", or one number if they are printed alike."""
     ordered = sorted(values)
-    return f"{ordered[0]:{sign}.{digits}f} to {ordered[-1]:{sign}.{digits}f}"
+    ends = (f"{round(end, digits) + 0.0:{sign}.{digits}f}" for end in (ordered[0], ordered[-1]))  # 0.0: no -0
+    return " to ".join(dict.fromkeys(ends))
 
 
 def sentences() -> Dict[str, List[str]]:
@@ -482,9 +483,9 @@ def sentences() -> Dict[str, List[str]]:
     bonsai = [key for key in text if key[0] == "bonsai" and key[1] < 0.005]
     edges = {scene: [less(found["smoe",], found["alpha",], name) for name in ("psnr_edge", "psnr")]
              for (scene, budget), found in by_budget.items() if (scene, budget) in (("fox", 4000), ("room35", 5700))}
-    sparse_plugged = plugged(("3dgs-2023", "3dgs-2024", "c3dgs"), "sparse")
-    dense_plugged = plugged(("3dgs-2023", "c3dgs"), "dense")
-    bounded = plugged(("taming", "hac", "hac-plus"), "sparse")[0], plugged(("taming", "hac", "hac-plus"), "dense")[0]
+    sparse_gains, sparse_saved = plugged(("3dgs-2023", "3dgs-2024", "c3dgs"), "sparse")
+    dense_gains, dense_saved_by = plugged(("3dgs-2023", "c3dgs"), "dense")
+    bounded = [span(plugged(("taming", "hac", "hac-plus"), end)[0], 1, "+") for end in ("sparse", "dense")]
     found = plugged_rows()
     compact = [found["compact-3dgs", "sparse"][rule] for rule in RULES]
     compact_gains = span([row["psnr"] - compact[0]["psnr"] for row in compact[1:]], 1)
@@ -538,15 +539,14 @@ def sentences() -> Dict[str, List[str]]:
             f"changes by {hac_gains} dB", f"{span(equal_gains, 2, '+')} dB at equal size",
             f"changes by {taming} dB where sparse, by {taming_dense} dB where dense",
             f"c3dgs {span(gained['c3dgs', 'sparse'], 1)} dB", f"changes by {gained_dense} dB with",
-            f"{saved_by['c3dgs', 'sparse'].split()[0]} % fewer Gaussians and {smaller['c3dgs', 'sparse']} % smaller "
-            "files",
+            f"{saved_by['c3dgs', 'sparse']} % fewer Gaussians and {smaller['c3dgs', 'sparse']} % smaller files",
             f"{saved_by['3dgs-2023', 'dense']} % fewer Gaussians", quicker, longer_few,
             f"{-min(equal_sizes):.0f} % smaller to {max(equal_sizes):.0f} % larger at equal PSNR",
             "at {:g} to {:g} dB on bonsai and {:g} to {:g} dB on fox".format(
                 *(end for scene in ("bonsai", "fox") for end in (LEVELS[scene][0], LEVELS[scene][-1]))),
-            f"save {dense_plugged[1].replace('fewer', 'of the Gaussians')} where dense, at {dense_plugged[0]}",
+            f"save {span(dense_saved_by)} % of the Gaussians where dense, at {span(dense_gains, 1, '+')} dB",
             f"{newest_span} where dense, with {span(fewer(smoe, alpha) for alpha, smoe in newest)} % fewer",
-            f"gain {sparse_plugged[0].replace('+', '')}", f"{bounded[0]} where sparse, {bounded[1]} where dense",
+            f"gain {span(sparse_gains, 1)} dB", f"{bounded[0]} dB where sparse, {bounded[1]} dB where dense",
             f"{span(sparse_gained, 1, '+')} dB", f"**yes:** {span(dense_saved)} % fewer",
             f"gains {text_gains['bonsai', 0.005]:.1f} dB at 0.005",
             f"{span(fewer(text[key]['Eq. 7'], text[key]['alpha']) for key in bonsai)} % fewer Gaussians than alpha and "
@@ -566,7 +566,7 @@ def sentences() -> Dict[str, List[str]]:
             "The loss ({:.1f} dB here) stays without its clamp ({:.1f}), with the opacity rate of 2023 ({:.1f}) and "
             "with both ({:.1f})".format(*changed_2024()),
             "-{:.1f} dB on bonsai and -{:.1f} on fox".format(*newest_loss),
-            f"{sparse_plugged[0]} with {sparse_plugged[1]}",
+            f"{span(sparse_gains, 1, '+')} dB with {span(sparse_saved)} % fewer",
             "30,000 iterations was bistable: {}, {} and {} dB (seeds 0 to 2), with 15,000 {}, {} and {}".format(
                 *(f"{row['psnr']:.2f}" for options in ("none", "--iterations 15000") for row in on_fox[options])),
             "By smoe 30,000 have {} and {}".format(*(f"{row['psnr']:.2f}" for row in
@@ -581,7 +581,8 @@ def sentences() -> Dict[str, List[str]]:
             f"HAC changes by {hac_gains} dB", f"Taming changes by {taming_all} dB",
             "edges gain {:.2f} where pictures gain {:.2f} dB on fox, ".format(*edges["fox"])
             + "{:.2f} for {:.2f} on room35".format(*edges["room35"]),
-            few.replace("fewer Gaussians ", ""), f"{-ablated[2]:.1f} and {-ablated[3]:.1f} dB against Eq. 7",
+            f"{saved['bonsai']} % on bonsai and {saved['fox']} % on fox",
+            f"{-ablated[2]:.1f} and {-ablated[3]:.1f} dB against Eq. 7",
             f"{slower_fps['program']} % slower", quicker, longer_few, f"lose up to {max(authors):.0f} dB"],
     }
 

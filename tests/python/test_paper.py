@@ -130,6 +130,11 @@ def test_what_the_pages_say_in_sentences_is_in_the_rows():
         assert not [text for text in texts if text not in said], f"{page}: see `python benchmarks/tables.py`"
 
 
+def test_a_range_whose_ends_are_printed_alike_is_one_number():
+    assert tables.span([3.4, 1.2, 2.0], 1) == "1.2 to 3.4" and tables.span([13.8, 14.2]) == "14"
+    assert tables.span([-0.04, 0.16], 1, "+") == "+0.0 to +0.2"
+
+
 def test_a_number_at_a_psnr_is_interpolated_in_its_logarithm():
     assert tables.number_at([(100, 20.0), (10_000, 30.0), (20_000, 29.0)], 25.0) == pytest.approx(1000)
     assert tables.number_at([(100, 20.0), (400, 30.0)], 31.0) is None
