@@ -240,6 +240,18 @@ def plugged_rows() -> Dict[Tuple[str, str], Dict[str, Row]]:
     return found
 
 
+def plugged_changes() -> Dict[Tuple[str, str], Dict[str, List[float]]]:
+    """Of each cell of `plugged_rows` what smoe, learned and as the authors' program, changes: dB that are gained, and
+    by how many per cent primitives are fewer and files smaller."""
+    found = {}
+    for key, rules in plugged_rows().items():
+        alpha, *others = (rules[rule] for rule in RULES if rule in rules)
+        found[key] = {"gained": [row["psnr"] - alpha["psnr"] for row in others],
+                      "fewer": [fewer([row], [alpha]) for row in others],
+                      "smaller": [100 * (1 - megabytes(row) / megabytes(alpha)) for row in others]}
+    return found
+
+
 def end_of(row: Row) -> str:
     return row["end"] or ("sparse" if row["densify_grad_threshold"] > 0.001 else "dense")
 
@@ -485,27 +497,16 @@ def sentences() -> Dict[str, List[str]]:
     sparse_plugged = plugged(("3dgs-2023", "3dgs-2024", "c3dgs"), "sparse")
     dense_plugged = plugged(("3dgs-2023", "c3dgs"), "dense")
     bounded = plugged(("taming", "hac", "hac-plus"), "sparse")[0], plugged(("taming", "hac", "hac-plus"), "dense")[0]
-    found = plugged_rows()
-    compact = [found["compact-3dgs", "sparse"][rule] for rule in RULES]
-    compact_gains = span([row["psnr"] - compact[0]["psnr"] for row in compact[1:]], 1)
-    compact_more = span([-fewer([row], compact[:1]) for row in compact[1:]])
-    compact_smaller = span([100 * (1 - megabytes(row) / megabytes(compact[0])) for row in compact[1:]])
-    gained, saved_by, smaller = {}, {}, {}
-    for key in (("c3dgs", "sparse"), ("3dgs-2023", "dense"), ("taming", "dense")):
-        alpha, *others = (found[key][rule] for rule in RULES)
-        gained[key] = [row["psnr"] - alpha["psnr"] for row in others]
-        saved_by[key] = span(fewer([row], [alpha]) for row in others)
-        smaller[key] = span(100 * (1 - megabytes(row) / megabytes(alpha)) for row in others)
+    gained, primitives, files = ({key: change[name] for key, change in plugged_changes().items()}
+                                 for name in ("gained", "fewer", "smaller"))
+    saved_by, smaller = ({key: span(values) for key, values in saved.items()} for saved in (primitives, files))
+    compact = "compact-3dgs", "sparse"
+    compact_gains, compact_more = span(gained[compact], 1), span(-part for part in primitives[compact])
     gained_dense = span(gained["3dgs-2023", "dense"], 2, "+")
-    hac = [(found["hac", end]["alpha"], found["hac", end][rule]) for end in ("sparse", "dense") for rule in RULES
-           if rule != "alpha"]
-    hac_gains = span([smoe["psnr"] - alpha["psnr"] for alpha, smoe in hac], 2, "+")
-    taming = span([found["taming", "sparse"][rule]["psnr"] - found["taming", "sparse"]["alpha"]["psnr"]
-                   for rule in RULES if rule != "alpha"], 2, "+")
-    taming_all = span([row["psnr"] - found["taming", end]["alpha"]["psnr"] for end in ("sparse", "dense")
-                       for rule, row in found["taming", end].items() if rule != "alpha"], 2, "+")
-    taming_dense = span(gained["taming", "dense"], 2, "+")
-    most_plugged = max(gained["taming", "dense"] + [smoe["psnr"] - alpha["psnr"] for alpha, smoe in hac])
+    hac, taming_both = (gained[method, "sparse"] + gained[method, "dense"] for method in ("hac", "taming"))
+    hac_gains, taming_all = span(hac, 2, "+"), span(taming_both, 2, "+")
+    taming, taming_dense = (span(gained["taming", end], 2, "+") for end in ("sparse", "dense"))
+    most_plugged = max(gained["taming", "dense"] + hac)
     equal_gains, equal_sizes = ([value for rule in RULES if rule != "alpha" for value in equal_size("hac", rule)[kind]]
                                 for kind in (0, 1))
     newest = plugged_2024()
@@ -534,7 +535,7 @@ def sentences() -> Dict[str, List[str]]:
             f"{span(faster['gsplat unpacked'], 1)} times as fast as gsplat"],
         "benchmarks/RESULTS.md": [
             f"HAC and Taming gain at most {most_plugged:.2f} dB", f"Compact-3DGS gains {compact_gains} dB",
-            f"{compact_more} % more Gaussians and {compact_smaller} % smaller files",
+            f"{compact_more} % more Gaussians and {smaller[compact]} % smaller files",
             f"changes by {hac_gains} dB", f"{span(equal_gains, 2, '+')} dB at equal size",
             f"changes by {taming} dB where sparse, by {taming_dense} dB where dense",
             f"c3dgs {span(gained['c3dgs', 'sparse'], 1)} dB", f"changes by {gained_dense} dB with",
