@@ -5,6 +5,7 @@ import dataclasses
 import glob
 import json
 import os
+import shlex
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 
@@ -404,7 +405,8 @@ class TrainConfig:
         differences = self.differences(later)
         if differences:
             raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `dsmoe train "
-                              f"--resume -o {self.output}` keeps the run's options; more --iterations extend it")
+                              f"--resume -o {shlex.quote(self.output)}` keeps the run's options; more --iterations "
+                              "extend it")
 
 
 def _recipe_of(strategy: str) -> Dict[str, Any]:
