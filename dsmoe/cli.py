@@ -208,14 +208,14 @@ def _train_in(group: Group, config: TrainConfig, layout: Optional[Layout], argum
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
-    if config.strategy == STRATEGY and not arguments.resume and not getattr(arguments, "budget", 0):
+    chooses = config.strategy == STRATEGY and not arguments.resume
+    if chooses and not getattr(arguments, "budget", 0):
         whose = "that of the model" if config.init else "chosen for the scene"
         print(f"note: that number is {whose}; --budget N makes more or fewer, and --strategy 3dgs is the "
               "densification of 3DGS")
-        if config.iterations < TrainConfig.iterations and not (
-                hasattr(arguments, "iterations") or arguments.fast or arguments.best):
-            print("note: fewer iterations, as the scene has few photographs; --iterations N sets another number, and "
-                  f"with --budget it is {TrainConfig.iterations}")
+    if chooses and config.iterations < TrainConfig.iterations and not (
+            hasattr(arguments, "iterations") or arguments.fast or arguments.best):
+        print("note: fewer iterations, as the scene has few photographs; --iterations N sets another number")
     for note in config.notes():
         print(f"note: {note}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
@@ -339,10 +339,10 @@ def _with_lpips(net: str, device: str) -> Measure:
     except (BenchError, ImportError, ValueError) as error:
         raise TrainerError(f"--lpips {net}: {error}") from error
 
-    def measure(image: Any, target: Any, mask: Any = None) -> Dict[str, Optional[float]]:
+    def measure(image: Any, target: Any, mask: Any, padding: str) -> Dict[str, Optional[float]]:
         if mask is not None:
             raise TrainerError("--lpips: the scene has masks, and LPIPS of a part of an image is not defined")
-        return {**image_metrics(image, target), "lpips_" + net: distance(quantised(image), target)}
+        return {**image_metrics(image, target, None, padding), "lpips_" + net: distance(quantised(image), target)}
 
     return measure
 

@@ -10,7 +10,7 @@ from .errors import TrainerError
 from .inspection import Trained, said_of_images, to_image, write_images
 from .options.choices import ORBIT_FRAMES, VIDEO_FPS
 from .options.early import check_orbit
-from .results.video import check_folder, check_video, is_video, write_video
+from .results.video import check_ending, check_video, is_video, write_video
 from .scenes.cameras import Camera
 from .system.progress import progress_bar
 
@@ -23,8 +23,7 @@ def film(trained: Trained, path: str, frames: int = ORBIT_FRAMES, fps: float = V
     images in such a folder. overwrite: files that are there may be replaced. Raises TrainerError.
     """
     check_orbit(frames, fps)
-    if not is_video(path):
-        check_folder(path, orbit=True)
+    check_ending(path, orbit=True)
     cameras = trained.orbit.cameras(frames, trained.cameras[0])
     if not is_video(path):
         of = f"{said_of_images(trained.config, trained.path, trained.renderer)}, an orbit of {frames}"

@@ -26,7 +26,7 @@ from .results.modelfile import (
 from .results.pictures import file_names
 from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
-from .results.video import check_folder
+from .results.video import check_ending
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
@@ -76,7 +76,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
         config, seconds = replace(config, iterations=opened.so_far.iteration), opened.so_far.seconds
     training = evaluate(renderer, scene.train, device, progress, psnr_alone, passes=1).metrics["psnr"]
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, training,
-                     renderer.background_gate)
+                     renderer.background_gate, earlier[0].get("protocol", {}).get("pinhole_every", 0) if earlier else 0)
     if earlier and "start" in earlier[0]:  # of `dsmoe simplify`
         row["start"] = earlier[0]["start"]
     if split == "test" and not is_other and not opened.so_far:
@@ -190,7 +190,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: O
     what `open_run` opens of the run that config is of, whose record these must not contradict. Raises TrainerError.
     """
     check_device(device)
-    check_folder(folder, orbit=False)
+    check_ending(folder, orbit=False)
     own_record(folder, RENDER, overwrite)  # refused before anything is read
     if ply is None:
         renderer, ply, _ = open_run(config, blend_mode, background_gate, device, rasterize, faint_below)

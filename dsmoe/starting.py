@@ -6,7 +6,7 @@ import functools
 import os
 import shlex
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Optional, Sequence
+from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from .results.evaluation import evaluate
 from .results.modelfile import (
     agreed_background_gate,
     agreed_blend_mode,
-    check_folder,
     model_path,
     read_gaussians,
     recorded_of,
@@ -132,14 +131,12 @@ def _read_start(path: str, *_: int) -> Start:
     count = len(gaussians.means3D)
     bad = count - int(finite_rows(raw_of(gaussians)).sum())
     if not count:
-        raise TrainerError(f"{path}: it holds no Gaussian")
+        raise TrainerError(f"{path}: it holds no Gaussians; name a model that has some")
     if bad:
         raise TrainerError(f"{path}: {bad:,} of its {count:,} Gaussians have a number that is NaN or infinite; `dsmoe "
                            f"export {shlex.quote(path)} -o clean.glb` leaves such Gaussians out")
     recorded = recorded_of(path, gaussians)
     gaussians = dataclasses.replace(gaussians, blend_mode=recorded.blend_mode)  # or of its folder
-    if recorded.blend_mode is None:
-        check_folder(path)
     mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")
     return Start(path, gaussians, mode, agreed_background_gate(path, mode, recorded, None), recorded.faint_below)
 
@@ -155,8 +152,7 @@ def find_model(source: str) -> Found:
     if not path:
         raise TrainerError(f"{source}: no model is in it: neither {CONFIG_NAME} of `dsmoe train` nor point_cloud/"
                            "iteration_N/point_cloud.ply of 3DGS" + runs_below(source))
-    options = _options_of_3dgs(source)
-    missing = "" if is_folder(options.get("scene", "")) else options.pop("scene", "")
+    options, missing = _options_of_3dgs(source)
     return Found(path, options, {"scene": source} if is_file(os.path.join(source, CAMERAS)) else {}, missing)
 
 
@@ -179,21 +175,28 @@ def _found_run(folder: str) -> Found:
                  "" if is_there else config.scene)
 
 
-def _options_of_3dgs(folder: str) -> Dict[str, Any]:
-    """What cfg_args says of the training but the blend, which `recorded_of` reads.
+def _options_of_3dgs(folder: str) -> Tuple[Dict[str, Any], str]:
+    """What cfg_args says of the training but the blend, which `recorded_of` reads; and a scene that is not there.
 
-    Where it had principal points is seen later.
+    Where it had principal points is seen later. A relative path of the scene begins in the current folder, as for 3DGS
+    itself, else in the model folder.
     """
     options: Dict[str, Any] = {}
-    known = cfg_args_of(folder)
-    if isinstance(known.get("source_path"), str):
-        options["scene"] = known["source_path"]
+    known, missing = cfg_args_of(folder), ""
+    scene = known.get("source_path")
+    if isinstance(scene, str) and scene:
+        places = [*dict.fromkeys(os.path.abspath(place) for place in (scene, os.path.join(folder, scene)))]
+        there = list(filter(is_folder, places))
+        if there:
+            options["scene"] = there[0]
+        else:
+            missing = " or ".join(places)
     for name, kind in (("images", str), ("resolution", int), ("white_background", bool), ("antialiasing", bool)):
         if isinstance(known.get(name), kind):
             options[name] = known[name]
     if known.get("eval") is False:  # then it trains on all images
         options["test_every"] = 0
-    return options
+    return options, missing
 
 
 def blend_options(start: Start, given: Dict[str, Any]) -> Dict[str, Any]:

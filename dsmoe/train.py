@@ -19,6 +19,7 @@ from .results.scalars import Scalars, scalar_files
 from .scenes.layout import Layout
 from .scenes.modelfolder import CAMERAS, cameras_content
 from .scenes.scene import Scene, describe_scene, load_scene, read_layout
+from .scenes.straight import pinhole_every
 from .starting import change_of_blend, check_start
 from .system.device import check_device
 from .system.files import is_file, write_atomically, write_json_atomically
@@ -132,7 +133,8 @@ class Run:
                        config.unusual_faint)
         evaluation = trainer.evaluate(self.progress)
         row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation,
-                         trainer.evaluate_training_views(self.progress), gate)
+                         trainer.evaluate_training_views(self.progress), gate,
+                         pinhole_every(trainer.scene.train, config.iterations))
         if not trainer.leads:
             return row
         folder = os.path.dirname(self._path(RESULTS_NAME))

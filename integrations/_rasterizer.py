@@ -231,22 +231,29 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
 
 
 def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torch.Tensor]) -> Settings:
-    """Returns the settings with a camera that depends on theta and rho, at 0, to first order."""
-    if settings.rolling_shutter != "global":
-        raise NotImplementedError(f"rasterize: rolling_shutter is {settings.rolling_shutter!r}; theta and rho are "
-                                  "offered for 'global'")
-    view = settings.viewmatrix  # transposed
+    """Returns the settings with a camera that depends on theta and rho, at 0, to first order.
+
+    Of a rolling shutter they follow both poses, which are mixed linearly: so the pose of every row.
+    """
+    view, end = settings.viewmatrix, settings.viewmatrix_end  # transposed
     zero = view.new_zeros(3)
     x, y, z = (zero if theta is None else theta.reshape(3) - theta.reshape(3).detach()).unbind()
     nothing = torch.zeros_like(x)
     turn = torch.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing]).reshape(3, 3)  # turn @ v = theta x v
     step = torch.cat([turn.T, (zero if rho is None else rho.reshape(3) - rho.reshape(3).detach())[None]])  # transposed
-    moved = view + torch.cat([view[:, :3] @ step[:3] + view[:, 3:] * step[3:], view.new_zeros(4, 1)], 1)
+
+    def motion(pose: torch.Tensor) -> torch.Tensor:
+        return torch.cat([pose[:, :3] @ step[:3] + pose[:, 3:] * step[3:], view.new_zeros(4, 1)], 1)
+
+    moved = view + motion(view)
     projection = getattr(settings, "projmatrix_raw", None)
     if projection is None:  # what the product of both says
         projection = torch.linalg.solve(view, settings.projmatrix)
     centre = -moved[3, :3] @ torch.linalg.inv(moved[:3, :3])
-    return settings._replace(viewmatrix=moved, projmatrix=moved @ projection, campos=centre)
+    if end is not None:
+        end = end + motion(end)
+        centre = (centre - end[3, :3] @ torch.linalg.inv(end[:3, :3])) / 2
+    return settings._replace(viewmatrix=moved, viewmatrix_end=end, projmatrix=moved @ projection, campos=centre)
 
 
 def _median_depth(settings: Settings, inputs: Dict[str, Any], maps: GateMap) -> torch.Tensor:
@@ -294,10 +301,12 @@ def scaled_gradient(factors: torch.Tensor, tensor: Any) -> Any:
 def visible_filter(self, means3D, scales=None, rotations=None, cov3D_precomp=None):
     """Returns the radii [N] int32 that a rendering would have, 0 for what the view does not see: a rasterizer's method.
 
-    means3D: [N, 3]; scales [N, 3] with rotations [N, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]` are
-    taken as they are. Which radii are 0 depends on the blend mode: the anchors need the mode of their rendering.
+    means3D: [N, 3]; scales [N, 3] with rotations [N or more, 4], or cov3D_precomp [N, 6]. Views such as `scales[:, :3]`
+    are taken as they are. Which radii are 0 depends on the blend mode: the anchors need the mode of their rendering.
     Raises ValueError or TypeError if arguments do not fit, as `rasterize` does.
     """
+    if rotations is not None:  # HAC++'s decoder makes fewer anchors, and leaves the rotations, all of them the identity
+        rotations = rotations[:len(means3D)]
     return visible_radii(means3D, as_ours(self.raster_settings, {})[0], scales, rotations, cov3D_precomp)
 
 

@@ -11,6 +11,7 @@ import difflib
 import importlib.util
 import os
 import re
+import shlex
 import shutil
 import tempfile
 from functools import partial
@@ -325,8 +326,8 @@ def _write(root: Path, files: Mapping[str, bytes], now: Mapping[str, bytes]) -> 
             os.replace(unfinished / name, target)
             there[target] = files[name]
     except OSError as error:
-        raise PatchError(f"{error.filename or root}: cannot be written: {error}; `dsmoe patch check {root}` says how "
-                         "the checkout is") from None
+        raise PatchError(f"{error.filename or root}: cannot be written: {error}; `dsmoe patch check "
+                         f"{shlex.quote(str(root))}` says how the checkout is") from None
     finally:
         for folder, process in _unfinished(root).items():  # but those of other processes that still run
             if process == str(os.getpid()) or not os.path.exists(f"/proc/{process}/fd"):

@@ -52,10 +52,13 @@ class Measures:
                                       f"no weights at hand: {said} (${variable} may name a file of them)")
 
     def __call__(self, color: torch.Tensor, target: torch.Tensor,
-                 mask: Optional[torch.Tensor] = None) -> Dict[str, Optional[float]]:
-        """color: a rendering [3, H, W]; mask: [1, H, W], the view's, by which LPIPS multiplies both images."""
+                 mask: Optional[torch.Tensor] = None, padding: str = "same") -> Dict[str, Optional[float]]:
+        """color: a rendering [3, H, W]; mask: [1, H, W], the view's, by which LPIPS multiplies both images.
+
+        padding: of SSIM's windows, as `fused_ssim` takes it.
+        """
         png = quantised(color)
-        metrics: Dict[str, Optional[float]] = {**image_metrics(color, target, mask),
+        metrics: Dict[str, Optional[float]] = {**image_metrics(color, target, mask, padding),
                                                "psnr_edge": edge_psnr(png, target, mask)}
         if mask is not None:
             png, target = png * mask, target * mask

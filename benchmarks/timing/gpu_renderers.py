@@ -56,8 +56,16 @@ class Renderer:
         return torch.autograd.grad(output, list(self.parameters.values()), dL_doutput)
 
 
-class Ours(Renderer):
-    """This project, one of its blends. Also makes the gradient of means2D, as a trainer needs it."""
+class WithMeans2D(Renderer):
+    """Also makes the gradient of means2D, as a trainer needs it."""
+
+    def make_parameters(self, inputs):
+        parameters = super().make_parameters(inputs)
+        return {**parameters, "means2D": torch.zeros_like(parameters["means3D"])}
+
+
+class Ours(WithMeans2D):
+    """This project, one of its blends."""
 
     blend = "alpha"
     more_settings: Dict[str, object] = {}
@@ -66,10 +74,6 @@ class Ours(Renderer):
         from diff_smoe_rasterization import rasterize
         self.rasterize = rasterize
         super().__init__(model)
-
-    def make_parameters(self, inputs):
-        parameters = super().make_parameters(inputs)
-        return {**parameters, "means2D": torch.zeros_like(parameters["means3D"])}
 
     def make_view(self, model, view):
         return model.settings(view, self.blend)._replace(**self.more_settings)
@@ -93,7 +97,7 @@ def ours(name: str) -> Type[Ours]:
     return type(name, (Ours,), {"blend": blend, "more_settings": MORE_SETTINGS[how], "is_alpha": blend == "alpha"})
 
 
-class Inria(Renderer):
+class Inria(WithMeans2D):
     """diff-gaussian-rasterization of 2023, and the base of what is derived from it."""
 
     folder = "inria"
@@ -105,10 +109,6 @@ class Inria(Renderer):
     def __init__(self, model: Model):
         self.module = importlib.import_module("diff_gaussian_rasterization")
         super().__init__(model)
-
-    def make_parameters(self, inputs):
-        parameters = super().make_parameters(inputs)
-        return {**parameters, "means2D": torch.zeros_like(parameters["means3D"])}
 
     def make_view(self, model, view):
         ours = model.settings(view, "alpha")

@@ -116,9 +116,8 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
     chooses, layout = options["strategy"] == STRATEGY, None
     if chooses and earlier:
         options = {"iterations": earlier.iterations, **options}
-    config = TrainConfig(**options)
-    if chooses or getattr(arguments, "scale_recipe", False):
-        config = dataclasses.replace(config.shortened(), **options)
+    shortens = chooses or getattr(arguments, "scale_recipe", False)
+    config = _scheduled(options) if shortens else TrainConfig(**options)
     if chooses and earlier:
         kept = {"budget", "init_points"} - {*given}
         config = dataclasses.replace(config, **{name: getattr(earlier, name) for name in kept})
@@ -129,13 +128,17 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
         from ..scenes.scene import read_layout
 
         layout = read_layout(config)
-        options = {**options, "iterations": iterations_for_scene(config, options, layout)}
-        config = dataclasses.replace(dataclasses.replace(config, **options).shortened(), **options)
+        config = _scheduled({**options, "iterations": iterations_for_scene(config, options, layout)})
         config = dataclasses.replace(config, **chosen_for_scene(config, given, layout))
     if earlier:
         earlier.check_continued_by(config)
     _check_learned(config, given)
     return config.validate(), layout
+
+
+def _scheduled(options: Dict[str, Any]) -> TrainConfig:
+    """The config of these options; milestones that they do not name keep their share of the iterations."""
+    return dataclasses.replace(TrainConfig(**options).shortened(), **options)
 
 
 def _check_learned(config: TrainConfig, given: Dict[str, Any]) -> None:

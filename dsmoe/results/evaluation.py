@@ -22,7 +22,7 @@ Measure = Callable[..., Mapping[str, Optional[float]]]
 METRICS = ("psnr", "ssim", "psnr_float")  # what image_metrics gives
 
 
-def psnr_alone(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None
+def psnr_alone(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None, padding: str = ""
                ) -> Dict[str, Optional[float]]:
     """The headline PSNR of `image_metrics`, without what takes longer."""
     return {"psnr": psnr(quantised(image), target, mask), "ssim": None, "psnr_float": None}
@@ -41,9 +41,9 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
              measure: Measure = image_metrics, passes: int = PASSES) -> Evaluation:
     """Renders every view; times only the rendering, synchronised, without loading, metrics or disk.
 
-    measure: from a rendering and its ground truth, [3, H, W], and its view's mask, [1, H, W] or None, to metrics by
-    name. passes: how often the views are rendered, as long as that takes less than SECONDS in all; the time of a view
-    is the median. Raises what `summary` raises.
+    measure: from a rendering and its ground truth, [3, H, W], its view's mask, [1, H, W] or None, and its camera's
+    padding to metrics by name. passes: how often the views are rendered, as long as that takes less than SECONDS in
+    all; the time of a view is the median. Raises what `summary` raises.
     """
     return summary(rows_of_views(lambda views: {0: renderer(views[0].camera).color}, [[view] for view in views], device,
                                  progress, measure, passes))
@@ -72,7 +72,8 @@ def rows_of_views(render: Callable[[Sequence[View]], Dict[int, torch.Tensor]], b
             colors, elapsed = timed(views)
             seconds.append([elapsed])
             rows.append([{"name": views[index].camera.name, "milliseconds": None,
-                          **measure(color, views[index].image_float(), views[index].mask_float())}
+                          **measure(color, views[index].image_float(), views[index].mask_float(),
+                                    views[index].camera.padding)}
                          for index, color in colors.items()])
         for _ in range(passes - 1):
             if agreed(sum(map(sum, seconds))) >= SECONDS:

@@ -7,7 +7,7 @@ from typing import Dict, Optional
 import torch
 import torch.nn.functional as F
 
-from diff_smoe_rasterization.losses import fused_ssim
+from diff_smoe_rasterization.losses import around, fused_ssim
 
 
 def quantised(image: torch.Tensor) -> torch.Tensor:
@@ -24,10 +24,10 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor]
     return math.inf if mean_squared_error == 0 else -10 * math.log10(mean_squared_error)
 
 
-def masked_ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> float:
+def masked_ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor, padding: str = "same") -> float:
     """SSIM of two images [3, H, W], both times the mask [1, H, W], averaged over the pixels as the mask counts them.
 
-    Window, constants and padding are those of `fused_ssim`, which gives only the plain mean.
+    Window, constants and padding, "same" or "around", are those of `fused_ssim`, which gives only the plain mean.
     """
     offsets = torch.arange(11, device=image.device) - 5.0
     line = torch.exp(-offsets**2 / (2 * 1.5**2)).double()
@@ -35,7 +35,7 @@ def masked_ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -
     x, y = ((picture * mask).double()[:, None] for picture in (image, target))  # channels as a batch: [3, 1, H, W]
 
     def blurred(planes: torch.Tensor) -> torch.Tensor:
-        return F.conv2d(planes, window, padding=5)
+        return F.conv2d(around(planes), window) if padding == "around" else F.conv2d(planes, window, padding=5)
 
     mean_x, mean_y = blurred(x), blurred(y)
     variances = blurred(x * x) - mean_x**2 + blurred(y * y) - mean_y**2
@@ -50,17 +50,19 @@ def _mean(values: torch.Tensor, mask: Optional[torch.Tensor]) -> float:
     return float(values.mean() if mask is None else (values * mask).sum() / (len(values) * mask.double().sum()))
 
 
-def image_metrics(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None) -> Dict[str, float]:
+def image_metrics(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None,
+                  padding: str = "same") -> Dict[str, float]:
     """Metrics of one rendering [3, H, W] against its ground truth in [0, 1], over what the mask [1, H, W] keeps.
 
     psnr, ssim: on 8-bit values (the headline). psnr_float: on floats clamped to [0, 1]. All of them are NaN if a
-    pixel of the rendering is NaN or infinite.
+    pixel of the rendering is NaN or infinite. padding: of SSIM's windows, "same" or "around".
     """
     if not bool(torch.isfinite(image).all()):  # clamping would hide the infinite ones
         return {"psnr": math.nan, "ssim": math.nan, "psnr_float": math.nan}
     png = quantised(image)
     return {
         "psnr": psnr(png, target, mask),
-        "ssim": float(fused_ssim(png, target, train=False)) if mask is None else masked_ssim(png, target, mask),
+        "ssim": (float(fused_ssim(png, target, padding, train=False)) if mask is None
+                 else masked_ssim(png, target, mask, padding)),
         "psnr_float": psnr(image.clamp(0, 1), target, mask),
     }

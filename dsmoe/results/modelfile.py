@@ -4,7 +4,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from typing import Any, NamedTuple, Optional, Tuple
+from typing import NamedTuple, Optional, Tuple, Union
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import (
@@ -35,7 +35,7 @@ class Recorded(NamedTuple):
     """What a file says of the blend that its Gaussians were trained with; None if it does not."""
 
     blend_mode: Optional[str]
-    background_gate: Optional[float]
+    background_gate: Union[float, str, None]  # LEARNED: its value is not said
     faint_below: Optional[float] = None  # also: as usual
 
 
@@ -93,14 +93,14 @@ def read_gaussians(path: str) -> io.Gaussians:
         other = ("; it is compressed, as SuperSplat does: let that write a .ply that is not"
                  if "packed_position" in text else
                  "; it is not a model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
-                 if "no scalar property" in text else "")
+                 if "no scalar property" in text or "no element" in text else "")
         raise TrainerError(text + other) from error
 
 
 def recorded_of(path: str, stored: io.Gaussians) -> Recorded:
     """What a file says of its blend, else the cfg_args of the 3DGS model folder that it lies in.
 
-    Raises TrainerError if its comment on `faint_below` is wrong.
+    Raises TrainerError for a comment on `faint_below`, and for values of cfg_args, that no training has.
     """
     said = [line.partition(" ")[2] for line in stored.comments if line.startswith(FAINT_BELOW + " ")]
     try:
@@ -113,45 +113,30 @@ def recorded_of(path: str, stored: io.Gaussians) -> Recorded:
 
 
 def _recorded_of_folder(path: str) -> Recorded:
-    """What the cfg_args of a 3DGS model folder says of its file; nothing if the gate was learned."""
-    mode, gate, faint = _blend_of_folder(path)
-    return Recorded(None, None) if gate == LEARNED else Recorded(mode, gate, faint)
-
-
-def _blend_of_folder(path: str) -> Tuple[Optional[str], Any, Optional[float]]:
     """The blend in the cfg_args of the 3DGS model folder that a file lies in, as `dsmoe patch` has it there.
 
-    It is mode, gate, which may be LEARNED, and `faint_below`. Raises TrainerError.
+    Raises TrainerError.
     """
     place = os.path.dirname(os.path.abspath(path))
     if os.path.basename(os.path.dirname(place)) != FOLDER:
-        return None, None, None
+        return Recorded(None, None)
     folder = os.path.dirname(os.path.dirname(place))
     known = cfg_args_of(folder)
     mode, gate, faint = (known.get(name) for name in PAPER_PROGRAM)
     if mode == PAPER:
         mode, gate, faint = PAPER_PROGRAM.values()
     if mode not in BLEND_MODES:
-        return None, None, None
+        return Recorded(None, None)
     if mode not in GATED_MODES:
-        return mode, None, None
+        return Recorded(mode, None)
     if gate == "":
         gate = LEARNED if mode == "smoe" else None  # the defaults of a training there
     try:
-        return (mode, gate if gate in (None, LEARNED) else float(resolve_background_gate(mode, float(gate))),
-                None if faint is None else resolve_faint_below(mode, faint))
+        return Recorded(mode, gate if gate in (None, LEARNED) else float(resolve_background_gate(mode, float(gate))),
+                        None if faint is None else resolve_faint_below(mode, faint))
     except (TypeError, ValueError) as error:
         raise TrainerError(f"{os.path.join(folder, CFG_ARGS)}: of the blend {mode} it records the background gate "
                            f"{gate!r} and faint_below {faint!r}; both must be numbers of at least 0") from error
-
-
-def check_folder(path: str) -> None:
-    """Raises TrainerError if a file that records no blend lies in a 3DGS model folder whose gate was learned."""
-    mode, gate, _ = _blend_of_folder(path)
-    if gate == LEARNED:
-        raise TrainerError(f"{path} records no blend, and its folder's cfg_args says {mode} with a learned background "
-                           f"gate, but not its value; declare it: `dsmoe export {shlex.quote(path)} --blend-mode "
-                           f"{mode} --background-gate X -o declared.ply`")
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
@@ -163,7 +148,6 @@ def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) 
         raise TrainerError(f"{path}: its comment records the blend mode {recorded!r}; this version knows "
                            f"{', '.join(BLEND_MODES)}")
     if recorded is None and asked is None:
-        check_folder(path)
         print(f"note: {printable(path)} records no blend mode, so it is alpha, as other 3DGS programs blend; "
               "--blend-mode says otherwise", file=sys.stderr)
         return "alpha"
@@ -176,7 +160,8 @@ def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) 
 def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> float:
     """The background gate to render a file with in this blend mode: by the rules of `agreed_blend_mode`.
 
-    A file that records a mode and no gate was trained with 0. Raises TrainerError.
+    A file that records a mode and no gate was trained with 0. Of a gate that was learned the value must be given.
+    Raises TrainerError.
     """
     if blend_mode not in GATED_MODES:
         fixed = float(resolve_background_gate(blend_mode, None))
@@ -186,7 +171,13 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
                                    f"{fixed:g}")
         return fixed
     gate = recorded.background_gate
-    if gate is None and recorded.blend_mode is not None:
+    if gate == LEARNED:
+        if asked is None:
+            raise TrainerError(f"{path} records no blend, and its folder's cfg_args says {blend_mode} with a learned "
+                               f"background gate, but not its value; declare it: `dsmoe export {shlex.quote(path)} "
+                               f"--blend-mode {blend_mode} --background-gate X -o declared.ply`")
+        gate = asked
+    elif gate is None and recorded.blend_mode is not None:
         gate = 0.0
     if gate is not None and asked is not None and asked != gate:
         raise TrainerError(f"{path} was trained with the background gate {gate!r}, not {asked!r}; "

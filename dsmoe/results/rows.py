@@ -18,15 +18,16 @@ from ..system.process import command
 from .evaluation import Evaluation
 
 RESULTS_NAME = "results.json"
+SSIM = "8-bit images, 11x11 window, sigma 1.5, zero padding, mean over test views"
 
 
 def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seconds: Optional[float],
-               evaluation: Evaluation, psnr_train: Optional[float] = None, background_gate: Optional[float] = None
-               ) -> Dict[str, Any]:
+               evaluation: Evaluation, psnr_train: Optional[float] = None, background_gate: Optional[float] = None,
+               pinhole_every: int = 0) -> Dict[str, Any]:
     """One row: the figures first, then the protocol that makes them comparable.
 
     psnr_train: over the training views, if it was measured. background_gate: the one that was rendered with; None: the
-    config's.
+    config's. pinhole_every: of how many views through lenses the training has shown one by a pinhole.
     """
     views = list(scene.test) or list(scene.train)
     first = views[0].camera
@@ -61,6 +62,10 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["undistortion"] = "by OpenCV, bicubic; focal lengths, principal points and sizes stay"
     if any(view.camera.lens for view in views):
         unusual["lenses"] = "native"
+    if pinhole_every:
+        unusual["pinhole_every"] = pinhole_every
+    if any(view.camera.is_panorama for view in views):
+        unusual["ssim"] = f"{SSIM}; windows of panoramas go across their seam"
     if any(view.mask is not None for view in views):
         unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"
     return {
@@ -88,7 +93,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
             "iterations": config.iterations,
             "seed": config.seed,
             "psnr": "8-bit images, mean over test views; psnr_float: floats clamped to [0, 1]",
-            "ssim": "8-bit images, 11x11 window, sigma 1.5, zero padding, mean over test views",
+            "ssim": SSIM,
             **unusual,
             "device": config.device,
             "machine": machine(config.device),

@@ -21,7 +21,7 @@ def is_video(path: str) -> bool:
     return os.path.splitext(path)[1].lower() in FORMATS
 
 
-def check_folder(path: str, orbit: bool) -> None:
+def check_ending(path: str, orbit: bool) -> None:
     """Raises TrainerError if a folder for images has the name of a video. orbit: whether a video could be made."""
     ending = os.path.splitext(path)[1].lower()
     if ending in FORMATS and not orbit:

@@ -44,6 +44,11 @@ class Camera:
         """Whether the image has all directions, and so a seam."""
         return self.lens is not None and self.lens.model == AROUND
 
+    @property
+    def padding(self) -> str:
+        """Of SSIM's windows at the image's borders, as `fused_ssim` takes it."""
+        return "around" if self.is_panorama else "same"
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another image size; intrinsics scale with the axes."""
         sx, sy = width / self.width, height / self.height

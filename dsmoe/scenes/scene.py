@@ -28,7 +28,7 @@ from .lens import NOT_UNDISTORTED
 from .modelfolder import CAMERAS, read_model_layout, rendered_views
 from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
-from .straight import EVERY
+from .straight import pinhole_every
 from .undistortion import trains_natively, undistorted
 
 if TYPE_CHECKING:
@@ -138,9 +138,9 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
         cannot = ", since OpenCV cannot undistort them" if set(models) <= NOT_UNDISTORTED else ""
         why = (cannot or ", since undistortion would cut off much of them") if chosen else ""
         masked = any(shown_by_lens(view.camera) is not None for view in views)
-        bent = any(view.camera.lens and not view.camera.is_panorama for view in views)
+        every = pinhole_every(scene.train, config.iterations)
         lines.append(f"images of camera model {', '.join(models)} stay as they are{why}; Gaussians are projected "
-                     f"through it{f', in a training each {EVERY}th time by a pinhole camera' * bent}"
+                     f"through it{f', in a training each {every}th time by a pinhole camera' * (every > 0)}"
                      f"{', pixels beyond the lens are masked' * masked}")
     if config.batch > len(scene.train):
         lines.append(f"note: a step of --batch {config.batch} shows some of the {len(scene.train)} training images "

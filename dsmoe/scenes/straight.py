@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import List, Sequence, Tuple
+from typing import Callable, List, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -15,46 +15,24 @@ import torch
 from .cameras import Camera
 from .images import View
 
-EVERY = 16  # of so many views through lenses, one is shown by a pinhole
+EVERY = 8  # of so many views through lenses, one is shown by a pinhole; even
+KEPT_BYTES = 2**30  # of pinhole images at most; what is more is made anew each time
+VIEW_BYTES, MAP_BYTES = 5, 9  # for each pixel: colours, opacity and mask; a place on the bent image, and whether it is
+
+Map = Tuple[torch.Tensor, torch.Tensor]
 
 
-class StraightViews:
-    """The pinhole images of views through lenses; they are made anew each time, as they would take as much memory.
-
-    Panoramas have none: what a pinhole sees of them is a few columns, magnified.
-    """
-
-    def __init__(self, cameras: Sequence[Camera]) -> None:
-        self._straight = {camera.name: dataclasses.replace(camera.pinhole(), name=f"{camera.name} (pinhole)")
-                          for camera in cameras if camera.lens and not camera.is_panorama}
-
-    @property
-    def cameras(self) -> List[Camera]:
-        """All that `of` may give."""
-        return [*self._straight.values()]
-
-    def of(self, view: View, iteration: int) -> View:
-        """What the training shows in this iteration: the view, or in each so many one, what a pinhole camera sees."""
-        camera = self._straight.get(view.camera.name)
-        return view if camera is None or iteration % EVERY else straightened(view, camera)
+def pinhole_every(views: Sequence[View], iterations: int) -> int:
+    """Of how many views of a training on these one is shown by a pinhole; 0: none is."""
+    return EVERY if iterations > 1 and any(_is_bent(view.camera) for view in views) else 0
 
 
-def straightened(view: View, camera: Camera) -> View:
-    """A view through a lens by a pinhole camera in its place. What the photograph does not show is masked."""
-    grid, shown = _places(dataclasses.replace(view.camera, name="", rotation=None, translation=None),
-                          dataclasses.replace(camera, name="", rotation=None, translation=None), str(view.image.device))
-
-    def seen(planes: torch.Tensor, mode: str) -> torch.Tensor:
-        values = torch.nn.functional.grid_sample(planes[None].float(), grid, mode, "border", align_corners=False)
-        return values[0].round().clamp(0, 255).to(torch.uint8)
-
-    mask = shown if view.mask is None else torch.minimum(seen(view.mask, "bilinear"), shown)
-    return dataclasses.replace(view, camera=camera, image=seen(view.image, "bicubic"), mask=mask,
-                               opacity=None if view.opacity is None else seen(view.opacity, "bicubic"))
+def _is_bent(camera: Camera) -> bool:
+    """But for panoramas: what a pinhole sees of them is a few columns, magnified."""
+    return camera.lens is not None and not camera.is_panorama
 
 
-@functools.lru_cache(maxsize=4)
-def _places(bent: Camera, straight: Camera, device: str) -> Tuple[torch.Tensor, torch.Tensor]:
+def _places(bent: Camera, straight: Camera, device: str) -> Map:
     """Where the pixels of a pinhole camera lie on the bent image, [1, H, W, 2] as `grid_sample` takes it.
 
     And [1, H, W] uint8: 255 where the image shows them, else 0. The cameras have the same pose, which does not matter.
@@ -76,3 +54,52 @@ def _places(bent: Camera, straight: Camera, device: str) -> Tuple[torch.Tensor, 
     shown = (prints.radii > 0) & (places.abs() <= 1).all(1)
     shape = (1, straight.height, straight.width)
     return places.masked_fill(~shown[:, None], -1).view(*shape, 2), (255 * shown).to(torch.uint8).view(shape)
+
+
+def straightened(view: View, camera: Camera, places: Callable[[Camera, Camera, str], Map] = _places) -> View:
+    """A view through a lens by a pinhole camera in its place. What the photograph does not show is masked."""
+    grid, shown = places(dataclasses.replace(view.camera, name="", rotation=None, translation=None),
+                         dataclasses.replace(camera, name="", rotation=None, translation=None), str(view.image.device))
+
+    def seen(planes: torch.Tensor, mode: str) -> torch.Tensor:
+        values = torch.nn.functional.grid_sample(planes[None].float(), grid, mode, "border", align_corners=False)
+        return values[0].round().clamp(0, 255).to(torch.uint8)
+
+    mask = shown if view.mask is None else torch.minimum(seen(view.mask, "bilinear"), shown)
+    return dataclasses.replace(view, camera=camera, image=seen(view.image, "bicubic"), mask=mask,
+                               opacity=None if view.opacity is None else seen(view.opacity, "bicubic"))
+
+
+class StraightViews:
+    """The pinhole images of views through lenses. They are made where they are first shown, and kept as far as told."""
+
+    def __init__(self, views: Sequence[View]) -> None:
+        self._bent = {view.camera.name: view for view in views if _is_bent(view.camera)}
+        self._straight = {name: dataclasses.replace(view.camera.pinhole(), name=f"{name} (pinhole)")
+                          for name, view in self._bent.items()}
+        self._pixels = max((camera.width * camera.height for camera in self.cameras), default=0)
+        self._most = min(len(self._bent), KEPT_BYTES // max(1, VIEW_BYTES * self._pixels))
+        self._made = functools.lru_cache(maxsize=self._most)(self._make)
+        self._places = functools.lru_cache(maxsize=1)(_places)  # most scenes have one lens
+
+    @property
+    def cameras(self) -> List[Camera]:
+        """All that `of` may give."""
+        return [*self._straight.values()]
+
+    @property
+    def most_bytes(self) -> int:
+        """Of memory, which the kept images, and where their pixels lie, take at most."""
+        return (self._most * VIEW_BYTES + MAP_BYTES) * self._pixels
+
+    def of(self, view: View, iteration: int) -> View:
+        """What the training shows in this iteration: the view, or in each so many one, what a pinhole camera sees.
+
+        These iterations are odd, since the loss curve takes every 10th or 100th (of a batch it takes the mean), and not
+        among the last ones.
+        """
+        name = view.camera.name
+        return self._made(name) if iteration % EVERY == 1 and name in self._bent else view
+
+    def _make(self, name: str) -> View:
+        return straightened(self._bent[name], self._straight[name], self._places)

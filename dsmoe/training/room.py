@@ -22,7 +22,10 @@ def gaussian_bytes(config: TrainConfig) -> int:
     return 4 * (FOR_EACH_PARAMETER * parameters + OTHERS + OF_A_FURTHER_VIEW * (config.batch - 1))
 
 
-def free_bytes(pixels: int) -> int:
-    """How much of this process's GPU is left for Gaussians, where images have so many pixels."""
-    kept = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()  # by torch, for later
-    return max(0, torch.cuda.mem_get_info()[0] + kept - PIXEL_BYTES * pixels)
+def free_bytes(pixels: int, kept: int = 0) -> int:
+    """How much of this process's GPU is left for Gaussians, where images have so many pixels.
+
+    kept: bytes of what a training will make and keep beside them.
+    """
+    cached = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()  # by torch, for later
+    return max(0, torch.cuda.mem_get_info()[0] + cached - PIXEL_BYTES * pixels - kept)

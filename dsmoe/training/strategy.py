@@ -134,12 +134,16 @@ class Strategy:
         """How many Gaussians there will be at most; 0: nobody knows."""
         return self.context.config.budget
 
-    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a rendering [3, H, W], and its gradient by it. target: floats, or bytes of 255ths."""
+    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor, padding: str = "same"
+             ) -> Tuple[torch.Tensor, torch.Tensor]:
+        """The loss of a rendering [3, H, W], and its gradient by it. target: floats, or bytes of 255ths.
+
+        padding: of SSIM's windows, as `fused_ssim` takes it.
+        """
         squares, lambda_dssim = self.squares(iteration), self.context.config.lambda_dssim
         if squares == 0:
-            return l1_ssim_loss_and_gradient(image, target, lambda_dssim)
-        return l2_ssim_loss_and_gradient(image, target, lambda_dssim, squares)
+            return l1_ssim_loss_and_gradient(image, target, lambda_dssim, padding)
+        return l2_ssim_loss_and_gradient(image, target, lambda_dssim, squares, padding)
 
     def squares(self, iteration: int) -> float:
         """The weight of the squared error in the loss, in place of the absolute one; 0: the loss of 3DGS."""

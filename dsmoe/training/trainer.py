@@ -60,7 +60,7 @@ class Trainer:
             background_gate=self.gate.value if self.gate else float(config.background_gate),
             faint_below=config.faint_below, deterministic=config.deterministic)
         cameras = [view.camera for view in self.scene.train]
-        self.straight = StraightViews(cameras)
+        self.straight = StraightViews(self.scene.train)
         self.renderer.prepare([*cameras, *self.straight.cameras])
         self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer,
@@ -112,7 +112,8 @@ class Trainer:
         if self.config.device == "cpu":
             return None
         pixels = max(view.camera.width * view.camera.height for view in self.scene.train)
-        free = [numbers[0] for numbers in self.group.gather_numbers([free_bytes(pixels)], self.config.device)]
+        here = free_bytes(pixels, self.straight.most_bytes)
+        free = [numbers[0] for numbers in self.group.gather_numbers([here], self.config.device)]
         return self.num_gaussians + self.group.size * min(free) // gaussian_bytes(self.config)
 
     def whole_model(self) -> Optional[GaussianModel]:
@@ -191,10 +192,10 @@ class Trainer:
     def loss_of(self, view: View, target: torch.Tensor, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         """The loss of a rendering and its gradient."""
         self._report = (image, target, view)
-        mask = view.mask_float()
+        mask, padding = view.mask_float(), view.camera.padding
         if mask is None:
-            return self.strategy.loss(self.iteration, image, target)
-        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask)
+            return self.strategy.loss(self.iteration, image, target, padding)
+        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask, padding)
         return loss, gradient * mask
 
     def training_psnr(self) -> float:

@@ -366,7 +366,7 @@ TEST(PlyErrors, NameFileAndReason) {
   const std::string ascii = "ply\nformat ascii 1.0\n";
   const std::string binary = "ply\nformat binary_little_endian 1.0\n";
   const std::pair<std::string, std::string> cases[] = {
-      {"", "no PLY file"},
+      {"", "cloud.ply: it has 0 bytes, so this is no PLY file, whose first line is \"ply\""},
       {"plyx\n", "no PLY file"},
       {"ply\n", "no end_header"},
       {ascii, "no end_header"},

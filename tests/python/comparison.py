@@ -65,6 +65,26 @@ def assert_same_gradients(actual, expected, tolerance=1e-5):
             assert_close(actual[name], values, tolerance if values.dtype == torch.float32 else 1e-12, name)
 
 
+def assert_is_the_references(rendering, actual, expected_rendering, expected, tolerance):
+    """Compares image, radii and gradients with what `reference_gradients` returns of 60 Gaussians, a part of them seen.
+
+    The gradient of means2D is among them: dL/d(pixel) times half the image's size.
+    """
+    assert_close(rendering.color, expected_rendering.color, tolerance, "color")
+    assert torch.equal(rendering.radii.cpu(), expected_rendering.radii)
+    assert (rendering.radii > 0).sum() > 20 and (rendering.radii == 0).sum() > 5
+    assert expected["means2D"][:, :2].any() and not actual["means2D"][:, 2].any()
+    assert_all_close(actual, expected, tolerance)
+
+
+def reference_contributions(scene, pixel_weights):
+    """Returns centres, depths and contributions, of the reference and on the CPU."""
+    scene = scene.to("cpu")
+    inputs = {name: tensor for name, tensor in scene.inputs.items() if name != "means2D"}
+    with one_thread(), on_the_cpu():
+        return reference.contributions(settings=scene.settings, pixel_weights=pixel_weights.cpu(), **inputs)
+
+
 def reference_gradients(scene, outputs=(), camera=True):
     """Returns (rendering, gradients by name) as scenes.gradients, of the reference and on the CPU."""
     with one_thread(), on_the_cpu():

@@ -39,6 +39,15 @@ def blend_of(mode):
     return BACKGROUND_GATES[mode][0] if mode in BACKGROUND_GATES else mode
 
 
+def spread(tensor):
+    """Returns the tensor as every second column of a wider one, whose others must not be read."""
+    fill = float("nan") if tensor.is_floating_point() else -1
+    wider = torch.full(tensor.shape[:-1] + (2 * tensor.shape[-1] + 1,), fill, dtype=tensor.dtype)
+    columns = wider[..., 1::2]
+    columns.copy_(tensor.detach())
+    return columns
+
+
 class Scene(NamedTuple):
     """Arguments of one call of `rasterize`."""
 

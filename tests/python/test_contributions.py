@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 from by_hand import facing_camera, on_axis
-from comparison import assert_close, assert_same_gradients, one_thread
-from devices import default_device, on_the_cpu, random_normal
+from comparison import assert_close, assert_same_gradients, reference_contributions
+from devices import default_device, random_normal
 from scenes import blend_of, gate_of, gradients, random_scene, transmittance_of, with_gate, with_gates
 
-from diff_smoe_rasterization import Contributions, GateMap, rasterize, rasterize_with_splats, reference
+from diff_smoe_rasterization import Contributions, GateMap, rasterize, rasterize_with_splats
 from diff_smoe_rasterization.settings import OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -40,14 +40,6 @@ def splats_of(scene, **more):
     return rasterize_with_splats(settings=scene.settings, **scene.inputs, **more)[1]
 
 
-def expected_of(scene, pixel_weights):
-    """Centres, depths and contributions, of the reference on the CPU."""
-    scene = scene.to("cpu")
-    inputs = {name: tensor for name, tensor in scene.inputs.items() if name != "means2D"}
-    with one_thread(), on_the_cpu():
-        return reference.contributions(settings=scene.settings, pixel_weights=pixel_weights.cpu(), **inputs)
-
-
 def assert_are(actual, expected, tolerance=TOLERANCE):
     assert isinstance(actual, Contributions)
     for name, values, other in zip(Contributions._fields, actual, expected):
@@ -64,7 +56,7 @@ def test_places_and_sums_are_the_references(mode, name):
     scene = SCENES[name](mode)
     pixel_weights = weights_for(scene.settings)
     rendering, splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)
-    centers, depths, expected = expected_of(scene, pixel_weights)
+    centers, depths, expected = reference_contributions(scene, pixel_weights)
     assert_close(splats.centers, centers, TOLERANCE, "centers")
     assert_close(splats.depths, depths, TOLERANCE, "depths")
     assert_are(splats.contributions(pixel_weights), expected)

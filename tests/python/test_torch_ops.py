@@ -103,28 +103,19 @@ def test_opcheck_of_mark_visible():
 
 
 @SHAPES
-def test_opcheck_of_contributions(mode):
+@pytest.mark.parametrize("name, maps, of_images", [
+    ("contributions", ["pixel_weights"], ["radii"]),
+    ("importance", ["pixel_weights", "share_weights"], ["radii", "color", "gate_sum"])])
+def test_opcheck_of_scores(mode, name, maps, of_images):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
     images, saved = op_results(scene)
-    op, weights = torch.ops.diff_smoe_rasterization.contributions.default, random_normal((18, 20), 1, torch.float32)
-    arguments = op_arguments(scene, "contributions", radii=images["radii"], saved=list(saved.values()),
-                             pixel_weights=weights)
+    weights = random_normal((18, 20), 1, torch.float32)
+    arguments = op_arguments(scene, name, saved=list(saved.values()), **dict.fromkeys(maps, weights),
+                             **{image: images[image] for image in of_images})
     # Sums by atomics differ in their last digits, which the last part of opcheck does not allow.
     parts = {} if weights.device.type == "cpu" else {
         "test_utils": ("test_schema", "test_autograd_registration", "test_faketensor")}
-    torch.library.opcheck(op, arguments, **parts)
-
-
-@SHAPES
-def test_opcheck_of_importance(mode):
-    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
-    images, saved = op_results(scene)
-    op, weights = torch.ops.diff_smoe_rasterization.importance.default, random_normal((18, 20), 1, torch.float32)
-    arguments = op_arguments(scene, "importance", saved=list(saved.values()), pixel_weights=weights,
-                             share_weights=weights, **{name: images[name] for name in ("radii", "color", "gate_sum")})
-    parts = {} if weights.device.type == "cpu" else {
-        "test_utils": ("test_schema", "test_autograd_registration", "test_faketensor")}
-    torch.library.opcheck(op, arguments, **parts)
+    torch.library.opcheck(getattr(torch.ops.diff_smoe_rasterization, name).default, arguments, **parts)
 
 
 @SHAPES

@@ -100,20 +100,13 @@ def test_means2D_may_be_left_out(mode):
     assert scene.inputs["means3D"].grad.any()
 
 
-def test_debug_changes_no_result(mode):
+@pytest.mark.parametrize("option", ["debug", "deterministic"])
+def test_what_only_checks_or_orders_changes_no_result(mode, option):
+    """On the CPU gradients always are reproducible; cuda/test_cuda_determinism.py has what a GPU promises."""
     scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
     plain, plain_gradient = gradients(rasterize, scene, OUTPUTS)
-    checked, checked_gradient = gradients(rasterize, scene.with_settings(debug=True), OUTPUTS)
-    assert all(torch.equal(a, b) for a, b in zip(plain, checked))
-    assert_same_gradients(checked_gradient, plain_gradient)
-
-
-def test_reproducible_gradients_are_the_same(mode):
-    """On the CPU they always are reproducible; cuda/test_cuda_determinism.py has what a GPU promises."""
-    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
-    plain, plain_gradient = gradients(rasterize, scene, OUTPUTS)
-    reproducible, gradient = gradients(rasterize, scene.with_settings(deterministic=True), OUTPUTS)
-    assert all(torch.equal(a, b) for a, b in zip(plain, reproducible))
+    images, gradient = gradients(rasterize, scene.with_settings(**{option: True}), OUTPUTS)
+    assert all(torch.equal(a, b) for a, b in zip(plain, images))
     assert_same_gradients(gradient, plain_gradient)
 
 

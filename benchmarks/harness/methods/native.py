@@ -50,7 +50,8 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
                    train_seconds=row["train_seconds"], peak_gpu_mib=peak, renders=renders,
                    history=read_json(history) if os.path.isfile(history) else [],
                    notes={"continued": continued, "scale_recipe": cell["protocol"]["scale_recipe"],
-                          "background_gate": row["background_gate"], **({"gpus": gpus} if gpus > 1 else {})})
+                          "background_gate": row["background_gate"], **({"gpus": gpus} if gpus > 1 else {}),
+                          **{name: value for name, value in row["protocol"].items() if name == "pinhole_every"}})
 
 
 def train_on(gpus: int, config: TrainConfig) -> Dict[str, Any]:

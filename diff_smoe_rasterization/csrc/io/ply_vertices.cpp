@@ -237,6 +237,9 @@ PlyVertices PlyVertices::parse(std::string bytes, const std::string& file) {
   PlyVertices vertices;
   vertices.file_ = file;
   vertices.bytes_ = std::move(bytes);
+  if (vertices.bytes_.empty()) {
+    vertices.fail("it has 0 bytes, so this is no PLY file, whose first line is \"ply\"; write or copy it again");
+  }
   LineCursor lines(vertices.bytes_, file);
   Header header = read_header(lines);
   vertices.comments_ = std::move(header.comments);

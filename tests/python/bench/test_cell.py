@@ -1,18 +1,22 @@
 """A cell by itself: one process, one row whatever happens, a GPU of its own or shared."""
 import json
+import shutil
 import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from bench_commands import python_that
 from checkouts import environment
 
+from diff_smoe_rasterization import io
 from dsmoe.bench import cell as cells
 from dsmoe.bench.expansion import expand
 from dsmoe.bench.methods import native
 from dsmoe.cli import main
 from dsmoe.errors import TrainerError
+from dsmoe.scenes.straight import EVERY
 
 
 @pytest.fixture
@@ -80,6 +84,20 @@ def test_a_cell_of_two_gpus_is_trained_by_torchrun(content, tmp_path, monkeypatc
     monkeypatch.setattr(native.torchrun, "launch", lambda gpus, words: 1)
     with pytest.raises(TrainerError, match="the training on 2 GPUs ended with status 1"):
         native.train_on(2, native.config_of(cell, folder))
+
+
+def test_a_cell_says_that_some_views_were_shown_by_a_pinhole(content, tiny_scene, tmp_path):
+    model = io.read_colmap(tiny_scene)
+    for key, camera in model.cameras.items():
+        model.cameras[key] = io.ColmapCamera(key, "OPENCV_FISHEYE", camera.width, camera.height,
+                                             np.array([*camera.params, 0.02, 0, 0, 0]))
+    shutil.copytree(tiny_scene, tmp_path / "bent")
+    io.write_colmap(str(tmp_path / "bent" / "sparse" / "0"), model)
+    cell = {**expand(content, "").cells[0], "blend_mode": "alpha", "background_gate": 1.0}
+    cell["scene"] = {**cell["scene"], "path": str(tmp_path / "bent")}
+    cell["protocol"] = {**cell["protocol"], "iterations": 2, "options": {"lenses": "native"}}
+    (tmp_path / "cell").mkdir()
+    assert native.run_native(cell, str(tmp_path / "cell")).notes["pinhole_every"] == EVERY
 
 
 @pytest.fixture

@@ -74,11 +74,10 @@ def test_a_splat_file_leaves_out_what_no_viewer_can_show(arrays):
     assert splat_bytes(gaussians(**arrays)) == whole[:32], "the second, which is first in the file"
 
 
-def test_a_model_without_gaussians_is_an_empty_file_and_an_empty_page(tmp_path):
+def test_a_model_without_gaussians_is_an_empty_page(tmp_path):
     nothing = gaussians(**{name: np.zeros((0, *shape)) for name, shape in [
         ("means3D", (3,)), ("dc", (1, 3)), ("shs", (15, 3)), ("opacity_logits", (1,)), ("log_scales", (3,)),
         ("rotations", (4,))]})
-    assert splat_bytes(nothing) == b""
     assert html.pack(nothing) == (0, b"", b"")
     path, page = str(tmp_path / "nothing.ply"), tmp_path / "page.html"
     io.write_gaussians(path, nothing)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from comparison import assert_close
 from devices import random_normal
-from scenes import REMOVABLE_MODES, random_scene
+from scenes import REMOVABLE_MODES, random_scene, turned
 
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.integrations import (
@@ -200,22 +200,32 @@ def exponential(theta, rho):
     return torch.matrix_exp(twist)
 
 
-def test_monogs_moves_the_camera_by_its_gradients():
-    """By finite differences along each axis: T becomes exp(rho, theta) T."""
+@pytest.mark.parametrize("shutter", ["global", "right_to_left"])
+def test_monogs_moves_the_camera_by_its_gradients(shutter):
+    """By finite differences along each axis: T becomes exp(rho, theta) T, both of a rolling shutter."""
     scene = random_scene("eq7_gate", 8, WIDTH, HEIGHT, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)
-    view = scene.settings.viewmatrix
-    raw = torch.linalg.solve(view, scene.settings.projmatrix)
+    poses = [scene.settings.viewmatrix]
+    if shutter != "global":
+        poses.append(turned(poses[0], (0.04, -0.05, 0.08), (0.1, 0.12, -0.07)))
+        scene = scene.with_settings(principal_point=(16.0, 11.0), rolling_shutter=shutter)
+    raw = torch.linalg.solve(poses[0], scene.settings.projmatrix)
     weights = random_normal((3, HEIGHT, WIDTH), 84)
     theta, rho = (torch.full((3,), 0.7, dtype=torch.float64, requires_grad=True) for _ in range(2))  # not read
-    color, _, depth, opacity, touched = rendered(monogs, scene, {"projmatrix_raw": raw}, theta=theta, rho=rho)
-    # 1e-7: the projection is the product of two matrices here, and that of the scene is rounded to float32.
-    assert_close(color, own(scene).color, 1e-7, "color")
-    (color * weights).sum().backward()
+
+    def moved(motion):
+        ends = [(motion @ pose.T).T for pose in poses]
+        centre = sum(torch.linalg.inv(end)[3, :3] for end in ends) / len(ends)
+        return scene.with_settings(viewmatrix=ends[0], projmatrix=ends[0] @ raw, campos=centre,
+                                   viewmatrix_end=None if shutter == "global" else ends[1])
 
     def loss(motion):
-        moved = (motion @ view.T).T
-        centre = torch.linalg.inv(moved)[3, :3]
-        return (own(scene.with_settings(viewmatrix=moved, projmatrix=moved @ raw, campos=centre)).color * weights).sum()
+        return (own(moved(motion)).color * weights).sum()
+
+    still = moved(torch.eye(4, dtype=torch.float64))
+    color, _, depth, opacity, touched = rendered(monogs, still, {"projmatrix_raw": raw}, theta=theta, rho=rho)
+    # 1e-7: the projection is the product of two matrices here, and that of the scene is rounded to float32.
+    assert_close(color, own(still).color, 1e-7, "color")
+    (color * weights).sum().backward()
 
     step = 1e-6
     for place, leaf in enumerate((theta, rho)):
@@ -226,7 +236,7 @@ def test_monogs_moves_the_camera_by_its_gradients():
             # The loss, up to 1e3, is rounded by 1e-13, and 2e-6 divides that; the step's own error is of order 1e-12.
             assert leaf.grad[axis].item() == pytest.approx(numeric, rel=1e-5, abs=1e-5)
     assert depth.shape == opacity.shape == (1, HEIGHT, WIDTH) and touched.dtype == torch.int32 and touched.any()
-    without = rendered(monogs, scene, {"projmatrix_raw": None}, theta=theta.detach())
+    without = rendered(monogs, still, {"projmatrix_raw": None}, theta=theta.detach())
     assert_close(without[0], color, 1e-9, "color without projmatrix_raw")
 
 

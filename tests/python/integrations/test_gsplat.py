@@ -83,6 +83,17 @@ def channels_last(images):
     return torch.stack([image.permute(1, 2, 0) for image in images])
 
 
+def assert_projections(meta, scene, cameras):
+    """Radii, centres and depths of `meta` are those of `project_gaussians`; of gsplat a first pixel's centre is 0.5."""
+    rotations = torch.nn.functional.normalize(scene.inputs["rotations"])
+    for camera, settings in enumerate(cameras):
+        prints = project_gaussians(settings=settings, **{**scene.inputs, "means2D": None, "rotations": rotations})
+        seen = prints.radii > 0
+        assert seen.any() and torch.equal(meta["radii"][camera, :, 0], prints.radii)
+        assert_close(meta["means2d"][camera][seen], prints.means2D[seen] + 0.5, TOLERANCE, "means2d")
+        assert_close(meta["depths"][camera][seen], prints.depths[seen], TOLERANCE, "depths")
+
+
 def test_the_order_of_arguments():
     """Those that gsplat's callers pass by position, and the names of the others."""
     names = list(inspect.signature(rasterization).parameters)
@@ -136,13 +147,7 @@ def test_lenses_are_the_references(camera_model, coefficients, own):
                                         coefficients.items()})
     expected = reference_renderings(scene.inputs, cameras)
     assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
-    for camera, settings in enumerate(cameras):
-        rotations = torch.nn.functional.normalize(scene.inputs["rotations"])
-        prints = project_gaussians(settings=settings, **{**scene.inputs, "means2D": None, "rotations": rotations})
-        seen = prints.radii > 0
-        assert seen.any() and torch.equal(meta["radii"][camera, :, 0], prints.radii)
-        assert_close(meta["means2d"][camera][seen], prints.means2D[seen] + 0.5, TOLERANCE, "means2d")
-        assert_close(meta["depths"][camera][seen], prints.depths[seen], TOLERANCE, "depths")
+    assert_projections(meta, scene, cameras)
 
 
 @pytest.mark.parametrize("shutter, own", [
@@ -163,13 +168,7 @@ def test_rolling_shutters_are_the_references(shutter, own):
                                      viewmats_rs=viewmats_rs)
     expected = reference_renderings(scene.inputs, cameras)
     assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
-    rotations = torch.nn.functional.normalize(scene.inputs["rotations"])
-    for camera, settings in enumerate(cameras):
-        prints = project_gaussians(settings=settings, **{**scene.inputs, "means2D": None, "rotations": rotations})
-        seen = prints.radii > 0
-        assert seen.any() and torch.equal(meta["radii"][camera, :, 0], prints.radii)
-        assert_close(meta["means2d"][camera][seen], prints.means2D[seen] + 0.5, TOLERANCE, "means2d")
-        assert_close(meta["depths"][camera][seen], prints.depths[seen], TOLERANCE, "depths")
+    assert_projections(meta, scene, cameras)
     renders.sum().backward()
     assert viewmats_rs.grad.abs().sum((1, 2)).min() > 0
 

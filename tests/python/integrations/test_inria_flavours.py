@@ -6,9 +6,15 @@ import re
 
 import pytest
 import torch
-from comparison import assert_all_close, assert_close, assert_same_gradients, reference_gradients
+from comparison import (
+    assert_all_close,
+    assert_close,
+    assert_is_the_references,
+    assert_same_gradients,
+    reference_gradients,
+)
 from packaged import packages_and_data
-from scenes import gradients, random_scene, random_weights
+from scenes import gradients, random_scene, random_weights, spread
 
 from diff_smoe_rasterization import Rendering, rasterize
 from diff_smoe_rasterization.integrations import c3dgs, inria, inria_2024, scaffold
@@ -87,15 +93,8 @@ def test_names_and_their_order(flavour):
 
 
 def test_images_radii_and_gradients_are_the_references(flavour, mode):
-    """The gradient of means2D among them: dL/d(pixel) times half the image's size."""
     scene = random_scene(mode, 60, 45, 30, seed=3)
-    rendering, actual = gradients(render_with(flavour), scene)
-    expected_rendering, expected = reference_gradients(scene)
-    assert_close(rendering.color, expected_rendering.color, TOLERANCE, "color")
-    assert torch.equal(rendering.radii.cpu(), expected_rendering.radii)
-    assert (rendering.radii > 0).sum() > 20 and (rendering.radii == 0).sum() > 5
-    assert expected["means2D"][:, :2].any() and not actual["means2D"][:, 2].any()
-    assert_all_close(actual, expected, TOLERANCE)
+    assert_is_the_references(*gradients(render_with(flavour), scene), *reference_gradients(scene), TOLERANCE)
 
 
 def test_an_opacity_may_exceed_one(flavour, mode):
@@ -110,13 +109,6 @@ def test_an_opacity_may_exceed_one(flavour, mode):
 def test_inputs_need_not_be_contiguous(flavour, mode):
     """HAC passes columns of wider tensors."""
     scene = random_scene(mode, 60, 45, 30, seed=5)
-
-    def spread(tensor):
-        wider = torch.full(tensor.shape[:-1] + (2 * tensor.shape[-1] + 1,), float("nan"), dtype=tensor.dtype)
-        columns = wider[..., 1::2]
-        columns.copy_(tensor.detach())
-        return columns
-
     strided = scene._replace(inputs={name: spread(tensor) for name, tensor in scene.inputs.items()})
     assert not any(tensor.is_contiguous() for tensor in strided.inputs.values())
     leaves = {name: tensor.requires_grad_(True) for name, tensor in strided.inputs.items()}

@@ -67,6 +67,14 @@ def gradient_at(value, view, gaussians, renderings=1):
     return fixed.grad.item()
 
 
+def assert_the_next_step_adds_up(view, gaussians, optimizer, slopes):
+    """After steps by these gradients comes one by the gradient at the value that they led to."""
+    slope = gradient_at(gate.value(), view, gaussians)
+    loss(view, gaussians).backward()
+    optimizer.step()
+    assert gate.value() == pytest.approx(by_hand([*slopes, slope]), rel=1e-5)
+
+
 def test_a_gate_steps_once_for_each_step_of_an_optimizer():
     """By Adam on the logarithm, from START; a rendering without gradient and a backward pass alone change nothing."""
     view, gaussians = scene()
@@ -89,10 +97,7 @@ def test_a_gate_steps_once_for_each_step_of_an_optimizer():
     optimizer.step()
     assert gate.value() == pytest.approx(once, rel=1e-5)
     optimizer.zero_grad()
-    second = gradient_at(gate.value(), view, gaussians)
-    loss(view, gaussians).backward()
-    optimizer.step()
-    assert gate.value() == pytest.approx(by_hand([slope, second]), rel=1e-5)
+    assert_the_next_step_adds_up(view, gaussians, optimizer, [slope])
 
 
 @pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")
@@ -228,10 +233,7 @@ def test_gradients_that_the_trainer_drops_do_not_count(set_to_none):
     optimizer.zero_grad(set_to_none=set_to_none)
     loss(view, gaussians).backward()
     optimizer.step()
-    second = gradient_at(gate.value(), view, gaussians)
-    loss(view, gaussians).backward()
-    optimizer.step()
-    assert gate.value() == pytest.approx(by_hand([slope, second]), rel=1e-5)
+    assert_the_next_step_adds_up(view, gaussians, optimizer, [slope])
 
 
 @pytest.mark.skipif(not HAS_HOOKS, reason="before torch 2.0 it steps in each backward pass")

@@ -93,6 +93,17 @@ def test_nothing_is_rendered():
         set_profiling(False)
 
 
+def test_decoded_anchors_of_hac_plus_have_more_rotations_than_anchors(mode):
+    scene = random_scene(mode, 300, 45, 30, seed=24)
+    rotations = scene.inputs["rotations"]
+    more = torch.cat([rotations, torch.full_like(rotations[:7], float("nan"))])
+    rasterizer = GaussianRasterizer(scene.settings)
+    radii = rasterizer.visible_filter(**shape_of(scene, "means3D", "scales"), rotations=more)
+    assert radii.any() and torch.equal(radii.cpu(), reference_radii(scene))
+    with pytest.raises(ValueError, match="rotations has shape"):
+        rasterizer.visible_filter(**shape_of(scene, "means3D", "scales"), rotations=rotations[:-1])
+
+
 def test_no_anchors_have_no_radii():
     scene = random_scene("alpha", 12).rows(slice(0))
     radii = GaussianRasterizer(scene.settings).visible_filter(**shape_of(scene, "means3D", "scales", "rotations"))

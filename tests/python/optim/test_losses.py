@@ -14,7 +14,7 @@ from diff_smoe_rasterization.losses import (
 )
 
 
-def direct_ssim(x, y, padding="same"):
+def ssim_map(x, y, padding="same"):
     """Wang et al. 2004 as written: one 11x11 Gaussian window of sigma 1.5, zeros outside. x, y: [B, C, H, W]."""
     grid = torch.arange(11, dtype=x.dtype) - 5
     window = torch.exp(-(grid[:, None] ** 2 + grid[None, :] ** 2) / (2 * 1.5**2))
@@ -27,7 +27,11 @@ def direct_ssim(x, y, padding="same"):
     mu_x, mu_y = mean(x), mean(y)
     var_x, var_y, cov = mean(x * x) - mu_x**2, mean(y * y) - mu_y**2, mean(x * y) - mu_x * mu_y
     c1, c2 = 0.01**2, 0.03**2
-    return ((2 * mu_x * mu_y + c1) * (2 * cov + c2) / ((mu_x**2 + mu_y**2 + c1) * (var_x + var_y + c2))).mean()
+    return (2 * mu_x * mu_y + c1) * (2 * cov + c2) / ((mu_x**2 + mu_y**2 + c1) * (var_x + var_y + c2))
+
+
+def direct_ssim(x, y, padding="same"):
+    return ssim_map(x, y, padding).mean()
 
 
 def direct_loss(x, y, weight):
@@ -114,6 +118,32 @@ def test_a_target_of_bytes_is_one_of_255ths(device, function):
     torch.testing.assert_close(loss, expected, rtol=1e-6, atol=0.0)
     # A GPU may contract the division into what follows: an ulp of the target, 6e-8, in gradients of 1 / numbers.
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-4, atol=1e-4 / image.numel())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(3, 20, 40), (1, 4, 8), (1, 3, 2)])
+def test_windows_go_around(device, dtype, shape):
+    """SSIM of the middle one of copies side by side; there are more of images that are narrower than a window."""
+    copies, width = 7, shape[-1]
+    middle = slice(copies // 2 * width, (copies // 2 + 1) * width)
+
+    def similarity(x, y):
+        return ssim_map(*(image.repeat(1, 1, copies) for image in (x, y)))[..., middle].mean()
+
+    def loss(x, y, l1, l2):
+        return l1 * (x - y).abs().mean() + l2 * (x - y).square().mean() + 0.3 * (1 - similarity(x, y))
+
+    image, target = image_pair(shape)
+    x, y = image.to(device, dtype).requires_grad_(), target.to(device, dtype)
+    for l1, l2, found in ((0.7, 0, l1_ssim_loss_and_gradient(x, y, 0.3, "around")),
+                          (0, 2.8, l2_ssim_loss_and_gradient(x, y, 0.3, 4.0, "around"))):
+        for actual, expected in zip(found, direct_gradient(loss, image, target, l1, l2)):
+            assert_close(actual, expected, dtype)
+    for actual, function, arguments in ((fused_ssim(x, y, "around"), similarity, ()),
+                                        (l1_ssim_loss(x, y, 0.3, "around"), loss, (0.7, 0))):
+        expected, expected_gradient = direct_gradient(function, image, target, *arguments)
+        assert_close(actual, expected, dtype)
+        assert_close(torch.autograd.grad(actual, x)[0], expected_gradient, dtype)
 
 
 @pytest.mark.parametrize("shape", [(3, 11, 11), (2, 3, 40, 21)])

@@ -107,8 +107,8 @@ def test_the_loss_is_the_one_with_which_the_run_ended(smoe_run, monkeypatch, opt
     losses = []
     loss = RisingGate.loss
 
-    def remembered(self, iteration, image, target):
-        value, gradient = loss(self, iteration, image, target)
+    def remembered(self, iteration, image, target, *padding):
+        value, gradient = loss(self, iteration, image, target, *padding)
         losses.append((value, l2_ssim_loss(image, as_float(target), 0.2, squares) if squares else
                        l1_ssim_loss(image, as_float(target), 0.2)))
         return value, gradient

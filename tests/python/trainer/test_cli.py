@@ -193,7 +193,7 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
     """Which takes seconds. A command without an action lists what there is."""
     ply = tmp_path / "a.ply"
     ply.write_text("")
-    (tmp_path / "model" / "point_cloud").mkdir(parents=True)
+    (tmp_path / "my model" / "point_cloud").mkdir(parents=True)
     said = {  # what is typed, and what is said of it
         "train|nowhere|-o|o": "scene nowhere: no such folder", f"train|{ply}|-o|o": "is a file; a scene is a folder",
         f"train|{scene}|-o|o|--iterations|0": "--iterations is 0; it must be at least 1",
@@ -203,7 +203,7 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         "scene|nowhere|-o|o": "no such folder of photographs", "eval|nowhere": "nowhere: no such folder",
         f"eval|{tmp_path}": "holds no config.json", "render|nowhere|-o|o": "no such file or folder",
         f"eval|{ply}": f"`dsmoe render {ply} --scene SCENE -o IMAGES` renders",
-        "eval|model": "`dsmoe render model --scene", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
+        "eval|my model": "`dsmoe render 'my model' --scene", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
         f"render|{ply}|-o|o|--scene|nowhere": "scene nowhere: no such folder", "view|nowhere": "no such file or folder",
         "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it"}
     listed = {"": "measure a trained run again", "patch": "take the patch out of every file",

@@ -17,16 +17,20 @@ from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from dsmoe.cli import main
 from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import SceneError
-from dsmoe.inspection import open_trained
+from dsmoe.inspection import open_run, open_trained
 from dsmoe.options.config import TrainConfig
+from dsmoe.results.evaluation import Evaluation, evaluate
+from dsmoe.results.rows import result_row
 from dsmoe.scenes import undistortion
 from dsmoe.scenes.cameras import Camera
+from dsmoe.scenes.images import View
 from dsmoe.scenes.lens import lens_of
 from dsmoe.scenes.modelfolder import _camera, cameras_content
 from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.scenes.straight import EVERY, straightened
+from dsmoe.scenes.straight import EVERY, StraightViews, _places, pinhole_every, straightened
 from dsmoe.system.files import ABANDONED, PART
+from dsmoe.train import PROGRESS_EVERY
 from dsmoe.training.trainer import Trainer
 
 WIDTH, HEIGHT = 96, 72
@@ -122,18 +126,18 @@ def test_every_model_becomes_a_pinhole_camera(tmp_path, monkeypatch, model, two_
 
 
 def fisheye_scene(folder, model="OPENCV_FISHEYE", k=(0.03, -0.01, 0.004, -0.001), count=8):
-    """A COLMAP scene of a cloud of Gaussians before and beside cameras of 170 degrees and more, and its points."""
+    """A COLMAP scene of a cloud of Gaussians before and beside cameras of 190 degrees and more, and its points."""
     generator = torch.Generator().manual_seed(3)
     directions = torch.nn.functional.normalize(torch.randn(60, 3, generator=generator), dim=1)
     means = 3 * torch.cat([directions[:, :2], directions[:, 2:].abs() - 0.2], 1)
     colors = torch.rand(60, 3, generator=generator)
-    params = [30.0, 31.0, CX, CY, *k]
+    params = [27.0, 28.0, CX, CY, *k]
     cameras = {1: io.ColmapCamera(1, model, WIDTH, HEIGHT, np.array(params))}
     images = []
     os.makedirs(folder / "images")
     for index in range(count):
         place = torch.tensor([0.25 * math.cos(index), 0.25 * math.sin(index), 0.1 * index])
-        settings = settings_from_camera([[30, 0, CX], [0, 31, CY], [0, 0, 1]], torch.eye(3), -place, WIDTH, HEIGHT,
+        settings = settings_from_camera([[27, 0, CX], [0, 28, CY], [0, 0, 1]], torch.eye(3), -place, WIDTH, HEIGHT,
                                         camera_model=lens_of(model, True, {}).camera_model, distortion=k)
         color = rasterize(means, torch.full((60,), 0.9), settings, colors_precomp=colors,
                           scales=torch.full((60, 3), 0.25), rotations=torch.tensor([[1.0, 0, 0, 0]] * 60)).color
@@ -157,24 +161,41 @@ def test_native_lenses_are_those_of_colmap(tmp_path, model, k):
     assert view.mask is None and not (tmp_path / ".dsmoe_cache").exists() and (view.image[0] == 9).all()
 
 
-def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
+def test_a_fisheye_of_190_degrees_trains_through_its_lens(tmp_path, capsys):
+    """Also what lies beyond 90 degrees, which no pinhole shows; and a pinhole shows what is before the camera.
+
+    Of 12 seeds the worst had 32.9 dB, 29.1 behind the camera and 32.7 by a pinhole; without steps by a pinhole the best
+    had 23.8 there.
+    """
     k = (0.03, -0.01, 0.004, -0.001)
+    degrees = np.radians([90, 95])
+    bent = degrees * (1 + sum(value * degrees ** (2 * power) for power, value in enumerate(k, 1)))
+    x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / 27, (np.arange(HEIGHT) + 0.5 - CY) / 28)
+    behind = np.hypot(x, y) > bent[0]
+    assert min(CX, WIDTH - CX) / 27 > bent[1] and behind.mean() > 0.1
     folder = fisheye_scene(tmp_path / "scene", "OPENCV_FISHEYE", k)
     output = str(tmp_path / "out")
-    assert main(["train", folder, "-o", output, "--iterations", "200", "--blend-mode", "smoe", "--background-gate", "0",
-                 "--device", "cpu", "--test-every", "4"]) == 0
+    assert main(["train", folder, "-o", output, "--iterations", "1000", "--blend-mode", "smoe", "--background-gate",
+                 "0", "--device", "cpu", "--test-every", "4"]) == 0
     assert "model OPENCV_FISHEYE stay as they are, since undistortion would cut off much" in capsys.readouterr().out
     with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
         row = json.load(file)
     row = row[0] if isinstance(row, list) else row
     assert row["protocol"]["lenses"] == "native"
-    assert row["psnr"] > 25, "33.8 dB after 1000; as a pinhole it would not even show what lies beside the camera"
+    assert row["psnr"] > 30
     assert main(["eval", output, "--device", "cpu"]) == 0
     assert f"{row['psnr']:.2f}" in capsys.readouterr().out
+    with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
+        assert json.load(file)[0]["protocol"]["pinhole_every"] == row["protocol"]["pinhole_every"] == EVERY
     assert main(["render", output, "--split", "test", "-o", str(tmp_path / "test"), "--device", "cpu"]) == 0
     shown, photograph = (np.asarray(Image.open(path).convert("RGB"), np.float64) for path in (
         next((tmp_path / "test").glob("**/0.png")), tmp_path / "scene" / "images" / "0.png"))
-    assert 10 * math.log10(255**2 / ((shown - photograph) ** 2).mean()) > 22
+    error = (shown - photograph)[behind] ** 2
+    assert 10 * math.log10(255**2 / error.mean()) > 25, "their mean colour has 16.8 dB"
+    config = TrainConfig.of_run(output, "--scene")
+    views, renderer = load_scene(config, progress=False).test, open_run(config, None, None, "cpu").renderer
+    with torch.no_grad():
+        assert evaluate(renderer, [straight(view) for view in views], "cpu", passes=1).metrics["psnr"] > 29
     with open(os.path.join(output, "cameras.json"), encoding="utf-8") as file:
         recorded = json.load(file)[0]
     assert recorded["camera_model"] == "fisheye" and tuple(recorded["distortion"]) == k
@@ -186,21 +207,47 @@ def test_a_wide_fisheye_trains_through_its_lens(tmp_path, capsys):
     page = (tmp_path / "model.html").read_text(encoding="utf-8")
     assert f'"fx": {first.fx}' in page and f'"fy": {first.fy}' in page
     assert main(["render", output, "--orbit", "--frames", "2", "-o", str(tmp_path / "orbit"), "--device", "cpu"]) == 0
-    assert main(["train", "--resume", output, "--lenses", "undistort", "--iterations", "201"]) == 1
+    assert main(["train", "--resume", output, "--lenses", "undistort", "--iterations", "1001"]) == 1
     assert "undistort" in capsys.readouterr().err
 
 
 def test_a_training_through_a_lens_shows_pinhole_images_too(tmp_path):
     """Of so many steps one, by the pose of its photograph; else viewers would show haze that no view shows."""
     config = TrainConfig(scene=fisheye_scene(tmp_path), lenses="native", test_every=0, device="cpu", blend_mode="alpha",
-                         iterations=2 * EVERY + 1).validate()
+                         iterations=2 * EVERY).validate()
     trainer = Trainer(config, load_scene(config, progress=False))
     shown = [trainer.step().view.camera for _ in range(config.iterations)]
     pinholes = [camera for camera in shown if not camera.lens]
-    assert pinholes == [shown[EVERY - 1], shown[2 * EVERY - 1]]
+    assert pinholes == [shown[0], shown[EVERY]]
     poses = {f"{view.camera.name} (pinhole)": view.camera for view in trainer.scene.train}
     for camera in pinholes:
         assert (camera.center == poses[camera.name].center).all() and camera.fx == WIDTH / 2, "90 degrees across"
+    view = trainer.scene.train[0]
+    for interval in PROGRESS_EVERY.values():
+        samples = [trainer.straight.of(view, iteration) for iteration in range(interval, 20 * interval, interval)]
+        assert all(sample is view for sample in samples), "of the loss curve, which would show two kinds of images"
+    assert pinhole_every([view], 2) == EVERY and pinhole_every([view], 1) == 0, "the last step changes nothing"
+    assert pinhole_every([straight(view)], 2) == 0
+
+
+@pytest.mark.parametrize("most", [0, 2, 4, 9])
+def test_pinhole_images_take_no_more_memory_than_is_told(monkeypatch, most):
+    """Of four lenses, with room for so many images; what is shown does not depend on what was kept."""
+    monkeypatch.setattr("dsmoe.scenes.straight.KEPT_BYTES", most * 5 * WIDTH * HEIGHT + 1)
+    planes = torch.randint(0, 256, (4, HEIGHT, WIDTH), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    views = [View(Camera(f"{index}", np.eye(3), np.zeros(3), FX + index, FY, CX, CY, WIDTH, HEIGHT,
+                         lens_of("OPENCV_FISHEYE", True, {"k1": 0.02})), planes[:3], planes[3:]) for index in range(4)]
+    many, kept = StraightViews(views), []
+    for view in [*views, *views]:
+        shown, alone = many.of(view, 1), straight(view)
+        for name in ("image", "opacity", "mask"):
+            assert torch.equal(getattr(shown, name), getattr(alone, name))
+        kept.append(shown)
+    again = sum(one is other for one, other in zip(kept[:4], kept[4:]))
+    assert again == (4 if most >= 4 else 0), "the oldest goes first"
+    held = sum(tensor.nbytes for view in kept[:min(most, 4)] for tensor in (view.image, view.opacity, view.mask))
+    assert many.most_bytes == held + sum(tensor.nbytes for tensor in _places(view.camera, view.camera.pinhole(), "cpu"))
+    assert StraightViews([]).most_bytes == 0
 
 
 def test_pinhole_images_keep_masks(tmp_path):
@@ -323,6 +370,8 @@ def test_panoramas_of_colmap(tmp_path):
     assert settings.camera_model == "equirectangular" and (settings.image_width, settings.image_height) == (64, 32)
     said = describe_scene(scene, layout, config)
     assert "EQUIRECTANGULAR stay as they are, since OpenCV cannot undistort them; Gaussians" in said
+    protocol = result_row(config, scene, 1, 0.0, Evaluation({}, None, []))["protocol"]
+    assert protocol["ssim"].endswith("go across their seam") and "pinhole_every" not in protocol
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
@@ -333,12 +382,12 @@ def test_a_panorama_has_no_seam(tmp_path, mode):
         image = Image.fromarray(np.roll(photograph, 32 * turned, 1))
         folder = write_scene(tmp_path / str(turned), "EQUIRECTANGULAR", [64, 32], image, 1, (64, 32), turned)
         options = dict(blend_mode=mode, background_gate=0.0) if mode == "smoe" else dict(blend_mode=mode)
-        config = TrainConfig(scene=folder, iterations=20, test_every=0, device="cpu", lambda_dssim=0.0,  # by windows,
-                             deterministic=True, **options)  # which do not go across the seam
+        config = TrainConfig(scene=folder, iterations=20, test_every=0, device="cpu", deterministic=True, **options)
         trainer = new_trainer(config, load_scene(config, progress=False))
         with torch.no_grad():
             trainer.model.raw["scales"] -= 1  # none is wider than the image
         losses = [float(trainer.step().loss) for _ in range(20)]  # more than EVERY: none by a pinhole
+        losses.append(evaluate(trainer.renderer, trainer.scene.train, "cpu", passes=1).metrics["ssim"])
         rendering = trainer.renderer(trainer.scene.train[0].camera)
         color, look = rendering.color.detach(), next(iter(trainer.passes.look(trainer.scene.train[:1])))
         assert len(rendering.radii) == len(look.costs) == trainer.num_gaussians

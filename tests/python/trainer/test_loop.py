@@ -125,7 +125,7 @@ def test_random_backgrounds_are_behind_rendering_and_image(tiny_config, scene, m
         return package_rasterizer()(means3D, opacities, settings, **arguments)
 
     monkeypatch.setattr(strategy, "l1_ssim_loss_and_gradient",
-                        lambda image, target, weight: targets.append(target) or l1_ssim(image, target, weight))
+                        lambda image, target, *others: targets.append(target) or l1_ssim(image, target, *others))
     scene = transparent_scene(scene)
     trainer = Trainer(tiny_config.changed(blend_mode="alpha", random_background=True), scene, rasterize)
     views = [trainer.step().view.camera for _ in range(4)]

@@ -52,7 +52,9 @@ def test_masked_ssim_is_that_of_the_masked_pair_over_the_kept_pixels():
     image, target = torch.rand(2, 3, 30, 40, generator=generator).unbind(0)
     # Everything kept: the kernel's own mean. float32 loses digits if moments are subtracted.
     everything = torch.ones(1, 30, 40)
-    assert masked_ssim(image, target, everything) == pytest.approx(float(fused_ssim(image, target)), abs=1e-5)
+    for padding in ("same", "around"):
+        expected = float(fused_ssim(image, target, padding))
+        assert masked_ssim(image, target, everything, padding) == pytest.approx(expected, abs=1e-5)
     # A kept rectangle in black: windows see zeros behind it, as behind the border of the rectangle alone.
     mask = torch.zeros(1, 30, 40)
     mask[:, 5:21, 8:33] = 1

@@ -16,7 +16,7 @@ from dsmoe.options.config import TrainConfig
 from dsmoe.results.glb import glb_bytes
 from dsmoe.results.modelfile import load_model
 from dsmoe.scenes.scene import load_scene
-from dsmoe.starting import read_start
+from dsmoe.starting import find_model, read_start
 from dsmoe.view.following import Followed
 
 ENDINGS = ("ply", "splat", "spz", "glb")
@@ -96,7 +96,7 @@ def test_a_glb_is_of_alpha_unless_it_says_otherwise(model, tmp_path, capsys):
     assert not (tmp_path / "no.ply").exists()
 
 
-def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_path, capsys):
+def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_path, capsys, monkeypatch):
     ply, folder = exported(model, tmp_path, "ply"), tmp_path / "model"
     for iteration in (7000, 30000):
         place = folder / "point_cloud" / f"iteration_{iteration}"
@@ -113,27 +113,39 @@ def test_a_model_folder_of_3dgs_says_where_its_scene_is(model, tiny_scene, tmp_p
     assert Followed(str(folder)).renderer.background.tolist() == [1, 1, 1]
     assert main(["export", str(folder), "-o", str(tmp_path / "page.html")]) == 0
     (folder / "cfg_args").write_text(said % "nowhere")
+    nowhere = f"{os.path.abspath('nowhere')} or {folder / 'nowhere'}"
     capsys.readouterr()
     assert main(["render", str(folder), "-o", str(tmp_path / "no")]) == 1
     assert capsys.readouterr().err.endswith(
-        f"{folder} holds no cameras, and the scene that it names, nowhere, is not there; name the folder that has "
-        "them with --scene\n")
+        f"{folder} holds no cameras, and the scene that it names, {nowhere}, is not there; name the folder that "
+        "has them with --scene\n")
     assert main(["simplify", str(folder), "--keep", "0.5", "-o", str(tmp_path / "no")]) == 1
-    assert "the scene that its folder names, nowhere, is not there, and the folder has no cameras.json; name its " \
+    assert f"the scene that its folder names, {nowhere}, is not there, and the folder has no cameras.json; name its " \
            "scene with --scene" in capsys.readouterr().err
     assert main(["export", str(folder), "-o", str(tmp_path / "gone.html")]) == 0
-    assert f"note: the scene that {folder} names, nowhere, is not there" in capsys.readouterr().err
+    assert f"note: the scene that {folder} names, {nowhere}, is not there" in capsys.readouterr().err
+    (folder / "cfg_args").write_text(said % "there")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for place in (folder / "there", tmp_path / "here" / "there"):  # the second counts more
+        shutil.copytree(tiny_scene, place)
+        assert find_model(str(folder)).options["scene"] == str(place)
     shutil.rmtree(folder / "point_cloud")
     for command in (["render"], ["view"], ["export"]):
         assert main([*command, str(folder), *["-o", str(tmp_path / "no.html")][:2 * (command != ["view"])]]) == 1
         assert "no model is in it: neither config.json of `dsmoe train` nor" in capsys.readouterr().err
 
 
-def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, tiny_scene, tmp_path, capsys):
+def in_model_folder(model, tmp_path, cfg_args):
+    """The path of the model, which records no blend, in a model folder of 3DGS whose trainer was given these."""
     place = tmp_path / "model" / "point_cloud" / "iteration_7"
     place.mkdir(parents=True)
-    shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
-    (tmp_path / "model" / "cfg_args").write_text(f"Namespace(eval=False, source_path={str(tiny_scene)!r})")
+    (tmp_path / "model" / "cfg_args").write_text(f"Namespace({cfg_args})")
+    return shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
+
+
+def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, tiny_scene, tmp_path, capsys):
+    in_model_folder(model, tmp_path, f"eval=False, source_path={str(tiny_scene)!r}")
     words = ["render", str(tmp_path / "model"), "-o", str(tmp_path / "images")]
     assert main([*words, "--split", "test"]) == 1 and "has no test views" in capsys.readouterr().err
     assert main(words) == 0
@@ -148,39 +160,43 @@ def test_a_model_folder_trained_on_all_images_shows_its_training_views(model, ti
     ("blend_mode='smoe_eq7', background_gate=''", ("smoe_eq7", 0, None)), ("blend_mode='other'", ("alpha", 1, None))])
 def test_cfg_args_says_how_a_file_without_a_record_is_blended(model, tiny_scene, tmp_path, said, blend):
     """None: as usual. What the file itself records counts more."""
-    place, copy = tmp_path / "model" / "point_cloud" / "iteration_7", str(tmp_path / "copy.ply")
-    place.mkdir(parents=True)
-    shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
-    (tmp_path / "model" / "cfg_args").write_text(f"Namespace({said}, source_path={str(tiny_scene)!r})")
+    copy, ply = str(tmp_path / "copy.ply"), in_model_folder(model, tmp_path, f"{said}, source_path={str(tiny_scene)!r}")
     opened = open_trained(str(tmp_path / "model")).renderer
     assert (opened.blend_mode, opened.background_gate, opened.faint_below) == blend
-    start = read_start(str(place / "point_cloud.ply"))
+    start = read_start(str(ply))
     assert (start.blend_mode, start.background_gate, start.faint_below) == blend
     assert main(["export", str(tmp_path / "model"), "-o", copy]) == 0
     assert io.read_gaussians(copy).blend_mode == (None if "other" in said else blend[0])
-    io.write_gaussians(str(place / "point_cloud.ply"), dataclasses.replace(model, blend_mode="smoe_std"))
+    io.write_gaussians(str(ply), dataclasses.replace(model, blend_mode="smoe_std"))
     assert open_trained(str(tmp_path / "model")).renderer.blend_mode == "smoe_std"
 
 
 def test_a_learned_gate_that_no_file_records_is_asked_for(model, tiny_scene, tmp_path, capsys):
-    place, declared = tmp_path / "model" / "point_cloud" / "iteration_7", str(tmp_path / "declared.ply")
-    place.mkdir(parents=True)
-    ply = shutil.copyfile(exported(model, tmp_path, "ply"), place / "point_cloud.ply")
-    text = f"Namespace(blend_mode='smoe', background_gate='learned', source_path={str(tiny_scene)!r})"
-    (tmp_path / "model" / "cfg_args").write_text(text)
+    declared, cfg_args = str(tmp_path / "declared.ply"), tmp_path / "model" / "cfg_args"
+    said = f"blend_mode='smoe', background_gate='learned', source_path={str(tiny_scene)!r}"
+    ply, text = in_model_folder(model, tmp_path, said), cfg_args.read_text()
     for words in (["render", "-o", str(tmp_path / "no")], ["simplify", "--keep", "1", "-o", str(tmp_path / "no")]):
         assert main([words[0], str(tmp_path / "model"), *words[1:]]) == 1
         assert "with a learned background gate, but not its value; declare it" in capsys.readouterr().err
     assert main(["export", str(ply), "-o", declared, "--blend-mode", "smoe", "--background-gate", "0.125"]) == 0
     assert load_model(declared, "cpu")[1] == ("smoe", 0.125, None)
-    (tmp_path / "model" / "cfg_args").write_text(text.replace("'learned'", "'much'"))
+    cfg_args.write_text(text.replace("source", "faint_below=1.5, source"))
+    for words, wrong in ((["--blend-mode", "alpha"], "was trained with the blend mode smoe, not alpha"),
+                         (["--background-gate", "0.125", "--faint-below", "3"], "its faint_below is 1.5, not 3")):
+        assert main(["export", str(tmp_path / "model"), "-o", str(tmp_path / "no.html"), *words]) == 1
+        assert wrong in capsys.readouterr().err
+    assert main(["export", str(ply), "-o", declared, "--background-gate", "0.5", "--overwrite"]) == 0
+    assert load_model(declared, "cpu")[1] == ("smoe", 0.5, 1.5), "the folder says the rest"
+    cfg_args.write_text(text.replace("'learned'", "'much'"))
     assert main(["render", str(tmp_path / "model"), "-o", str(tmp_path / "no")]) == 1
     assert "cfg_args: of the blend smoe it records the background gate 'much'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("ending, content, words", [
     ("splat", bytes(33), "33 bytes; a .splat has 32 for each Gaussian"), ("glb", b"glTF", "not a .glb of Gaussians"),
-    ("ksplat", bytes(64), "it is none of .ply, .splat, .spz and .glb"), ("ply", bytes(64), "this is no PLY file")])
+    ("ksplat", bytes(64), "it is none of .ply, .splat, .spz and .glb"), ("ply", bytes(64), "this is no PLY file"),
+    ("ply", b"", 'it has 0 bytes, so this is no PLY file, whose first line is "ply"'),
+    ("ply", b"ply\nformat ascii 1.0\nend_header\n", 'no element "vertex"; it is not a model of Gaussians')])
 def test_what_is_no_model_is_named_by_every_command(tiny_scene, tmp_path, capsys, ending, content, words):
     path = tmp_path / f"model.{ending}"
     path.write_bytes(content)

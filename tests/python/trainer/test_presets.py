@@ -116,8 +116,10 @@ def test_as_many_points_are_taken_as_time_allows(tiny_scene, monkeypatch):
 
 
 @pytest.mark.parametrize("views, iterations", [(1, 15_000), (50, 15_000), (60, 18_000), (100, 30_000), (500, 30_000)])
-def test_few_photographs_train_for_fewer_iterations(tiny_scene, views, iterations):
-    """A training view is seen 300 times, but for the bounds."""
+def test_few_photographs_train_for_fewer_iterations(tiny_scene, monkeypatch, views, iterations):
+    """A training view is seen 300 times, but for the bounds, and for a budget below the scene's two for each point."""
+    monkeypatch.setitem(NUMBERS, "cpu", Numbers(2, 10, 1000, 20, 100))
+
     def chosen(*given, **options):
         config = TrainConfig(scene=tiny_scene, strategy="importance", blend_mode="smoe", **options)
         layout = read_layout(config)
@@ -126,12 +128,15 @@ def test_few_photographs_train_for_fewer_iterations(tiny_scene, views, iteration
     assert chosen() == iterations
     assert chosen(batch=1000) == iterations, "a multiple of the batch"
     assert chosen(batch=16) == {15_000: 15_008, 18_000: 18_000, 30_000: 30_000}[iterations]
-    assert chosen(budget=70) == chosen("iterations") == chosen("densify_until_iter") == 30_000
+    assert chosen(budget=200) == chosen("init_points", budget=288) == iterations, "as with the number that is chosen"
+    assert chosen(budget=199) == chosen("init_points", budget=287) == 30_000
+    assert chosen("iterations") == chosen("densify_until_iter") == 30_000
 
 
 def test_the_milestones_follow_the_chosen_iterations(tiny_scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(presets, "LEAST_ITERATIONS", 20)
     monkeypatch.setattr(presets, "PER_VIEW", 1)
+    monkeypatch.setitem(NUMBERS, "cpu", Numbers(8, 10, 2000, 20, 1000))
     output = str(tmp_path / "out")
     words = ["train", tiny_scene, "-o", output, "--quiet", "--rotation-lr", "0.003"]
     assert main(words) == 0
@@ -139,6 +144,9 @@ def test_the_milestones_follow_the_chosen_iterations(tiny_scene, tmp_path, capsy
     config = TrainConfig.load(output)
     assert (config.iterations, config.densify_until_iter, config.position_lr_max_steps) == (20, 10, 20)
     assert (config.rotation_lr, config.budget) == (0.003, 144 * 2**3), "growth doubles 144 points at 2, 3 and 4"
+    assert main([*words[:3], output + "_budget", *words[4:], "--budget", "1152"]) == 0
+    assert "note: fewer iterations, as the scene has few photographs" in capsys.readouterr().out
+    assert TrainConfig.load(output + "_budget").iterations == 20
     for more in ([], ["--scale-recipe"]):
         assert main([*words, "--resume", *more]) == 0, "it keeps its length"
     assert main([*words, "--overwrite", "--iterations", "20"]) == 0

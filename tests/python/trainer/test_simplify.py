@@ -469,7 +469,7 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
             "clean.glb`") in fails(ply, *scene)
     arrays = ("means3D", "dc", "shs", "opacity_logits", "log_scales", "rotations")
     io.write_gaussians(ply, dataclasses.replace(stored, **{name: getattr(stored, name)[:0] for name in arrays}))
-    assert "my model.ply: it holds no Gaussian\n" in fails(ply, *scene)
+    assert "my model.ply: it holds no Gaussians; name a model that has some\n" in fails(ply, *scene)
     io.write_gaussians(ply, stored)
     assert main(["simplify", ply, *scene, "--budget", "100000", "-o", output, "--device", "cpu"]) == 1
     assert f"--init '{ply}'`" in capsys.readouterr().err
@@ -492,6 +492,11 @@ def test_bad_models_are_told_and_nothing_is_written(run, tmp_path, capsys):
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex 1\n{packed}end_header\n"
     (tmp_path / "packed.ply").write_bytes(header.encode() + bytes(16))
     assert "it is compressed, as SuperSplat does" in fails(str(tmp_path / "packed.ply"), *scene)
+    stored = io.read_gaussians(ply)
+    none = {name: getattr(stored, name)[:0] for name in ("means3D", "dc", "shs", "opacity_logits", "log_scales",
+                                                         "rotations")}
+    io.write_gaussians(str(tmp_path / "none.ply"), dataclasses.replace(stored, **none))
+    assert "none.ply: it holds no Gaussians; name a model that has some" in fails(str(tmp_path / "none.ply"), *scene)
     main(["simplify", ply, "--budget", "40", "-o", output])
     assert "neither photographs nor cameras are known; name its scene with --scene" in capsys.readouterr().err
     (tmp_path / "bare").mkdir()
