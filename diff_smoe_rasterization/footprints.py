@@ -171,8 +171,8 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
     shape = list(footprints.features.shape)
     columns = settings.bg.numel() + sum(name in outputs for name in FEATURE_OUTPUTS)
     if len(shape) == 2 and shape[1] != columns:  # the op would take rows that are filled up
-        raise ValueError(f"blend_footprints: features has shape {shape}; it must be {[shape[0], columns]}, by the "
-                         "background and the outputs, which both halves take")
+        raise ValueError(f"blend_footprints: features has shape {shape}; it must be {[shape[0], columns]}; give "
+                         "project_gaussians and blend_footprints the same outputs and background")
     if _wants_gradient(tensors):
         images = _Blend.apply((*options, True), *tensors)
     else:

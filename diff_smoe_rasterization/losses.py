@@ -19,7 +19,7 @@ def l1_ssim_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float 
     """(1 - lambda) mean |image - target| + lambda (1 - SSIM), the loss of 3D Gaussian Splatting.
 
     image: [..., H, W], float32 or float64. target: of the same shape and type, or uint8 (then 255 is 1); it gets no
-    gradient. SSIM and padding are as in `fused_ssim`.
+    gradient. SSIM and padding are as in `fused_ssim`; the mean of |image - target| is over all pixels in any case.
     Raises ValueError or TypeError if shapes, types or devices do not fit.
     """
     check_tensors("l1_ssim_loss", image=image, target=target)
@@ -52,9 +52,9 @@ def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", tr
     """Mean structural similarity (Wang et al. 2004) of images in [0, 1]: 11x11 Gaussian window of sigma 1.5.
 
     img1, img2: [B, C, H, W] or [C, H, W]. padding: "same", windows reach into zeros outside the image; "valid", the
-    mean leaves out the 5 pixels at each side whose windows do; "around", windows reach across the left and the right
-    border to the other one, as those of 360 degrees meet. train: whether a gradient may be asked for; only img1 gets
-    one. The call is as in the package `fused_ssim`.
+    mean leaves out the 5 pixels at each side whose windows do, so H and W must be at least 11; "around", windows reach
+    across the left and the right border to the other one, as those of 360 degrees meet. train: whether a gradient may
+    be asked for; only img1 gets one. The call is as in the package `fused_ssim`.
     Raises ValueError or TypeError if arguments do not fit.
     """
     check_tensors("fused_ssim", img1=img1, img2=img2)
@@ -88,8 +88,8 @@ def _loss(with_gradient: bool, image: torch.Tensor, target: torch.Tensor, l1_wei
         return _OPS.image_loss(image, target, l1_weight, l2_weight, ssim_weight, offset, _MARGINS[padding],
                                with_gradient)
     loss, gradient = _OPS.image_loss(image, target, l1_weight, l2_weight, 0.0, offset, 0, with_gradient)
-    similarity, by_larger = _OPS.image_loss(around(image), around(target), 0.0, 0.0, ssim_weight, 0.0, _WINDOW_RADIUS,
-                                            with_gradient)
+    similarity, by_larger = _OPS.image_loss(with_columns_around(image), with_columns_around(target), 0.0, 0.0,
+                                            ssim_weight, 0.0, _WINDOW_RADIUS, with_gradient)
     if with_gradient:  # each column adds up what came to its copies
         width, zeros = image.shape[-1], -_WINDOW_RADIUS % image.shape[-1]
         by_columns = torch.nn.functional.pad(by_larger[..., _WINDOW_RADIUS:-_WINDOW_RADIUS, :], (zeros, zeros))
@@ -97,8 +97,9 @@ def _loss(with_gradient: bool, image: torch.Tensor, target: torch.Tensor, l1_wei
     return loss + similarity, gradient
 
 
-def around(image: torch.Tensor) -> torch.Tensor:
-    """An image [..., H, W] with what windows reach: columns of the other border, and rows of zeros."""
+def with_columns_around(image: torch.Tensor) -> torch.Tensor:
+    """[..., H + 10, W + 10]: an image [..., H, W] with what windows reach: 5 columns of the other border at each side,
+    and 5 rows of zeros above and below."""
     columns = torch.arange(-_WINDOW_RADIUS, image.shape[-1] + _WINDOW_RADIUS, device=image.device) % image.shape[-1]
     return torch.nn.functional.pad(image[..., columns], (0, 0, _WINDOW_RADIUS, _WINDOW_RADIUS))
 

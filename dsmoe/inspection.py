@@ -30,6 +30,7 @@ from .results.video import check_ending
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
+from .scenes.straight import pinhole_every
 from .starting import find_model
 from .system.device import check_device
 from .system.files import is_file, is_folder, write_json_atomically
@@ -71,12 +72,16 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
                            f"{'with' if masked else 'without'} them: these would be figures of other pixels; "
                            f"{'put them back' if masked else 'rename the folder'}, or name another --scene")
     renderer, seconds = opened.renderer, earlier[0].get("train_seconds") if earlier else None
+    if earlier:
+        by_pinhole = earlier[0].get("protocol", {}).get("pinhole_every", 0)
+    else:  # what another scene was trained with is not known
+        by_pinhole = 0 if is_other else pinhole_every(scene.train, config.iterations)
     evaluation = evaluate(renderer, views, device, progress, measure)
     if opened.so_far:
         config, seconds = replace(config, iterations=opened.so_far.iteration), opened.so_far.seconds
     training = evaluate(renderer, scene.train, device, progress, psnr_alone, passes=1).metrics["psnr"]
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, training,
-                     renderer.background_gate, earlier[0].get("protocol", {}).get("pinhole_every", 0) if earlier else 0)
+                     renderer.background_gate, by_pinhole)
     if earlier and "start" in earlier[0]:  # of `dsmoe simplify`
         row["start"] = earlier[0]["start"]
     if split == "test" and not is_other and not opened.so_far:

@@ -65,7 +65,7 @@ def given_inputs(settings: Settings, inputs: Dict[str, Any]) -> Dict[str, Any]:
     """
     means, checked = inputs["means3D"], {}
     check_tensor("rasterize", "means3D", means)
-    for name in ("bg", "viewmatrix", "projmatrix"):
+    for name in ("bg", "viewmatrix", "projmatrix", "campos"):
         check_tensor("rasterize", name, getattr(settings, name))
     _check_axes("bg", settings.bg, ("C",))
     for name, value in inputs.items():
@@ -231,10 +231,12 @@ def as_ours(settings: Settings, inputs: Dict[str, Any]) -> Tuple[Settings, Dict[
 
 
 def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torch.Tensor]) -> Settings:
-    """Returns the settings with a camera that depends on theta and rho, at 0, to first order.
+    """Returns the settings with a camera that depends on theta and rho, at 0, to first order. Its values stay.
 
     Of a rolling shutter they follow both poses, which are mixed linearly: so the pose of every row.
     """
+    for name, size in (("projmatrix", 16), ("campos", 3)):
+        check_size(name, getattr(settings, name), size)
     view, end = settings.viewmatrix, settings.viewmatrix_end  # transposed
     zero = view.new_zeros(3)
     x, y, z = (zero if theta is None else theta.reshape(3) - theta.reshape(3).detach()).unbind()
@@ -253,7 +255,10 @@ def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torc
     if end is not None:
         end = end + motion(end)
         centre = (centre - end[3, :3] @ torch.linalg.inv(end[:3, :3])) / 2
-    return settings._replace(viewmatrix=moved, viewmatrix_end=end, projmatrix=moved @ projection, campos=centre)
+    projection = moved @ projection
+    return settings._replace(viewmatrix=moved, viewmatrix_end=end,
+                             projmatrix=settings.projmatrix + (projection - projection.detach()),
+                             campos=settings.campos + (centre - centre.detach()))
 
 
 def _median_depth(settings: Settings, inputs: Dict[str, Any], maps: GateMap) -> torch.Tensor:
@@ -305,8 +310,8 @@ def visible_filter(self, means3D, scales=None, rotations=None, cov3D_precomp=Non
     are taken as they are. Which radii are 0 depends on the blend mode: the anchors need the mode of their rendering.
     Raises ValueError or TypeError if arguments do not fit, as `rasterize` does.
     """
-    if rotations is not None:  # HAC++'s decoder makes fewer anchors, and leaves the rotations, all of them the identity
-        rotations = rotations[:len(means3D)]
+    if all(isinstance(given, torch.Tensor) and given.dim() == 2 for given in (means3D, rotations)):
+        rotations = rotations[:len(means3D)]  # HAC++'s decoder leaves more than anchors, all of them the identity
     return visible_radii(means3D, as_ours(self.raster_settings, {})[0], scales, rotations, cov3D_precomp)
 
 

@@ -108,7 +108,8 @@ ImageSize read_size(const CommandLine& line) {
     throw UsageError("--size is \"" + text + "\"; it must be like 1280x720 or 1280");
   }
   if (size.width > kLargestSide || size.height > kLargestSide) {
-    throw UsageError("--size is \"" + text + "\"; it must be at most 16384 pixels a side");
+    throw UsageError("--size is \"" + text + "\"; it must be at most " + std::to_string(kLargestSide) +
+                     " pixels a side");
   }
   return size;
 }
@@ -153,7 +154,8 @@ std::vector<View> choose_views(const CommandLine& line, const Model& model) {
     const double height = size.height > 0 ? size.height : size.width > 0 ? std::round(width * shape) : view.height;
     if (width > kLargestSide || height > kLargestSide) {
       throw UsageError("camera " + view.name + " has " + std::to_string(view.width) + "x" +
-                       std::to_string(view.height) + " pixels; pass a --size of at most 16384 pixels a side");
+                       std::to_string(view.height) + " pixels; pass a --size of at most " +
+                       std::to_string(kLargestSide) + " pixels a side");
     }
     view = resized(view, width, std::max(1, static_cast<int>(height)));
   }

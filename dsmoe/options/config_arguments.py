@@ -9,7 +9,7 @@ from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MOD
 
 from ..errors import ConfigError
 from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
-from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, iterations_for_scene, with_preset
+from .presets import NUMBERS, PRESETS, STRATEGY, chosen_for_scene, iterations_for_scene, scheduled, with_preset
 
 if TYPE_CHECKING:
     from ..scenes.layout import Layout
@@ -117,7 +117,7 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
     if chooses and earlier:
         options = {"iterations": earlier.iterations, **options}
     shortens = chooses or getattr(arguments, "scale_recipe", False)
-    config = _scheduled(options) if shortens else TrainConfig(**options)
+    config = scheduled(options) if shortens else TrainConfig(**options)
     if chooses and earlier:
         kept = {"budget", "init_points"} - {*given}
         config = dataclasses.replace(config, **{name: getattr(earlier, name) for name in kept})
@@ -128,17 +128,12 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
         from ..scenes.scene import read_layout
 
         layout = read_layout(config)
-        config = _scheduled({**options, "iterations": iterations_for_scene(config, options, layout)})
+        config = scheduled({**options, "iterations": iterations_for_scene(options, layout)})
         config = dataclasses.replace(config, **chosen_for_scene(config, given, layout))
     if earlier:
         earlier.check_continued_by(config)
     _check_learned(config, given)
     return config.validate(), layout
-
-
-def _scheduled(options: Dict[str, Any]) -> TrainConfig:
-    """The config of these options; milestones that they do not name keep their share of the iterations."""
-    return dataclasses.replace(TrainConfig(**options).shortened(), **options)
 
 
 def _check_learned(config: TrainConfig, given: Dict[str, Any]) -> None:

@@ -22,8 +22,8 @@ Measure = Callable[..., Mapping[str, Optional[float]]]
 METRICS = ("psnr", "ssim", "psnr_float")  # what image_metrics gives
 
 
-def psnr_alone(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None, padding: str = ""
-               ) -> Dict[str, Optional[float]]:
+def psnr_alone(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None,
+               padding: str = "same") -> Dict[str, Optional[float]]:
     """The headline PSNR of `image_metrics`, without what takes longer."""
     return {"psnr": psnr(quantised(image), target, mask), "ssim": None, "psnr_float": None}
 

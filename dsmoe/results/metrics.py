@@ -7,7 +7,7 @@ from typing import Dict, Optional
 import torch
 import torch.nn.functional as F
 
-from diff_smoe_rasterization.losses import around, fused_ssim
+from diff_smoe_rasterization.losses import fused_ssim, with_columns_around
 
 
 def quantised(image: torch.Tensor) -> torch.Tensor:
@@ -35,7 +35,9 @@ def masked_ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor, p
     x, y = ((picture * mask).double()[:, None] for picture in (image, target))  # channels as a batch: [3, 1, H, W]
 
     def blurred(planes: torch.Tensor) -> torch.Tensor:
-        return F.conv2d(around(planes), window) if padding == "around" else F.conv2d(planes, window, padding=5)
+        if padding == "around":
+            return F.conv2d(with_columns_around(planes), window)
+        return F.conv2d(planes, window, padding=5)
 
     mean_x, mean_y = blurred(x), blurred(y)
     variances = blurred(x * x) - mean_x**2 + blurred(y * y) - mean_y**2

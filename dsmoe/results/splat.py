@@ -16,7 +16,7 @@ def splat_bytes(gaussians: Gaussians) -> bytes:
 
     Each has its position and its three standard deviations in world units, colour of degree 0 and opacity in 8 bits,
     and its quaternion (w, x, y, z) as 128 + 128 q in 8 bits. Left out are Gaussians that are not finite, and those
-    whose quaternion is 0, which viewers cannot turn into a rotation.
+    whose quaternion is 0, which viewers cannot turn into a rotation. Raises TrainerError if none is left.
     """
     position, logit, log_scales, rotations, dc, _ = rotatable_rows(gaussians)
     opacity = 1 / (1 + np.exp(-logit.astype(np.float64)))

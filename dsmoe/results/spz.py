@@ -32,7 +32,8 @@ def spz_bytes(gaussians: Gaussians) -> bytes:
     """The file's content: version 3, in the axes of OpenGL as its specification says.
 
     Left out are Gaussians that are not finite, and those whose quaternion is 0. A Gaussian that is too far away for the
-    format moves towards the origin and shrinks by the same factor, so it looks the same from there.
+    format moves towards the origin and shrinks by the same factor, so it looks the same from there. Raises TrainerError
+    if none is left, or without the package gsply.
     """
     check_spz()
     import gsply

@@ -277,5 +277,6 @@ def test_footprints_that_do_not_fit_are_refused(change, error, text):
 
 def test_depth_needs_footprints_that_have_it():
     scene = random_scene("alpha")
-    with pytest.raises(ValueError, match=r"\[120, 3\]; it must be \[120, 4\], by the .* outputs, which both"):
+    with pytest.raises(ValueError, match=r"\[120, 3\]; it must be \[120, 4\]; give project_gaussians and "
+                                         "blend_footprints the same outputs and background"):
         blend_footprints(project_gaussians(settings=scene.settings, **scene.inputs), scene.settings, ("depth",))

@@ -104,6 +104,20 @@ def test_decoded_anchors_of_hac_plus_have_more_rotations_than_anchors(mode):
         rasterizer.visible_filter(**shape_of(scene, "means3D", "scales"), rotations=rotations[:-1])
 
 
+@pytest.mark.parametrize("name", ["means3D", "rotations"])
+def test_what_is_no_matrix_is_refused_as_rasterize_does(name):
+    scene = random_scene("alpha", 12)
+    shape = shape_of(scene, "means3D", "scales", "rotations")
+    wrong = [(5, TypeError, f"{name} is of type int; it must be a torch.Tensor"),
+             *((torch.ones(sizes, dtype=torch.float64), ValueError, rf"{name} has shape \[{text}\]; it must be")
+               for sizes, text in (((), ""), ((12,), "12")))]
+    if name == "means3D":
+        wrong.append((None, TypeError, "means3D is of type NoneType; it must be a torch.Tensor"))
+    for value, error, words in wrong:
+        with pytest.raises(error, match=words):
+            GaussianRasterizer(scene.settings).visible_filter(**{**shape, name: value})
+
+
 def test_no_anchors_have_no_radii():
     scene = random_scene("alpha", 12).rows(slice(0))
     radii = GaussianRasterizer(scene.settings).visible_filter(**shape_of(scene, "means3D", "scales", "rotations"))

@@ -146,14 +146,30 @@ def test_windows_go_around(device, dtype, shape):
         assert_close(torch.autograd.grad(actual, x)[0], expected_gradient, dtype)
 
 
-@pytest.mark.parametrize("shape", [(3, 11, 11), (2, 3, 40, 21)])
-def test_valid_padding_leaves_out_windows_that_reach_outside(device, shape):
-    image, target = image_pair(shape)
-    expected, expected_gradient = direct_gradient(direct_ssim, image, target, "valid")
-    x = image.to(device).requires_grad_()
-    actual = fused_ssim(x, target.to(device), padding="valid")
-    assert_close(actual, expected, torch.float64)
-    assert_close(torch.autograd.grad(actual, x)[0], expected_gradient, torch.float64)
+@pytest.mark.parametrize("function, weights", [
+    (fused_ssim, (0, 0, 0, 1)), (l1_ssim_loss, (0.7, 0, 0.3, -0.3)), (l1_ssim_loss_and_gradient, (0.7, 0, 0.3, -0.3)),
+    (l2_ssim_loss_and_gradient, (0, 0.7 * 4, 0.3, -0.3))])
+def test_valid_padding_leaves_out_windows_that_reach_outside(device, function, weights):
+    """weights: of the L1 and the L2 part, both over all pixels, of 1, and of SSIM."""
+    numbers = () if function is fused_ssim else (0.3, 4.0) if function is l2_ssim_loss_and_gradient else (0.3,)
+
+    def direct(x, y):
+        l1, l2, one, ssim = weights
+        return l1 * (x - y).abs().mean() + l2 * (x - y).square().mean() + one + ssim * direct_ssim(x, y, "valid")
+
+    for shape in ((3, 11, 11), (2, 3, 40, 21)):
+        image, target = image_pair(shape)
+        x, y = image.to(device).requires_grad_(), target.to(device)
+        found = function(x, y, *numbers, padding="valid")
+        if isinstance(found, torch.Tensor):
+            found = found, torch.autograd.grad(found, x)[0]
+        for actual, expected in zip(found, direct_gradient(direct, image, target)):
+            assert_close(actual, expected, torch.float64)
+    with pytest.raises(ValueError, match="its sides must be at least 11"):
+        function(x[..., :10, :].detach(), y[..., :10, :], *numbers, padding="valid")
+    for wrong in ("zero", None, 5):
+        with pytest.raises(ValueError, match=f"{function.__name__}: padding is {wrong!r}; it must be one of same, val"):
+            function(x, y, *numbers, padding=wrong)
 
 
 def test_gradient_by_finite_differences(device):
@@ -212,10 +228,6 @@ def test_what_does_not_fit_is_refused(device):
             l1_ssim_loss(image, target)
     with pytest.raises(TypeError, match="image is float16"):
         l1_ssim_loss(image.half(), image.half())
-    with pytest.raises(ValueError, match="padding is 'zero'"):
-        fused_ssim(image, image, padding="zero")
-    with pytest.raises(ValueError, match="its sides must be at least 11"):
-        fused_ssim(image[:, :10], image[:, :10], padding="valid")
     with pytest.raises(ValueError, match="margin is 4611686018427387904; it must be 0 to"):  # twice that wraps to 0
         torch.ops.diff_smoe_rasterization.image_loss(image.detach(), image.detach(), 0.5, 0.0, 0.5, 0.0, 2 ** 62, False)
     with pytest.raises(ValueError, match="at least one pixel"):
@@ -238,5 +250,3 @@ def test_what_is_no_tensor_or_no_number_is_named(wrong):
     if not isinstance(wrong, int):
         with pytest.raises(TypeError, match=f"l2_ssim_loss_and_gradient: weight is of type {kind}; it must be a n"):
             l2_ssim_loss_and_gradient(image, image, 0.2, wrong)
-    with pytest.raises(ValueError, match="fused_ssim: padding is "):
-        fused_ssim(image, image, padding=wrong)

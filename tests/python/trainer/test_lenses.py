@@ -17,7 +17,7 @@ from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from dsmoe.cli import main
 from dsmoe.distributed.trainer import new_trainer
 from dsmoe.errors import SceneError
-from dsmoe.inspection import open_run, open_trained
+from dsmoe.inspection import evaluate_run, open_run, open_trained
 from dsmoe.options.config import TrainConfig
 from dsmoe.results.evaluation import Evaluation, evaluate
 from dsmoe.results.rows import result_row
@@ -30,7 +30,7 @@ from dsmoe.scenes.orbit import orbit_of_cameras
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
 from dsmoe.scenes.straight import EVERY, StraightViews, _places, pinhole_every, straightened
 from dsmoe.system.files import ABANDONED, PART
-from dsmoe.train import PROGRESS_EVERY
+from dsmoe.train import PROGRESS_EVERY, train
 from dsmoe.training.trainer import Trainer
 
 WIDTH, HEIGHT = 96, 72
@@ -209,6 +209,20 @@ def test_a_fisheye_of_190_degrees_trains_through_its_lens(tmp_path, capsys):
     assert main(["render", output, "--orbit", "--frames", "2", "-o", str(tmp_path / "orbit"), "--device", "cpu"]) == 0
     assert main(["train", "--resume", output, "--lenses", "undistort", "--iterations", "1001"]) == 1
     assert "undistort" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("scene_is_other", [False, True])
+def test_a_run_without_results_says_that_pinhole_images_were_shown(tmp_path, scene_is_other):
+    """Unless it is measured on another scene, whose lenses say nothing of the training."""
+    folder, output = fisheye_scene(tmp_path / "scene", count=4), str(tmp_path / "out")
+    config = TrainConfig(scene=folder, output=output, test_every=2, blend_mode="alpha", iterations=2, lenses="native")
+    train(config.validate(), progress=False)
+    os.remove(os.path.join(output, "results.json"))
+    if scene_is_other:
+        os.remove(os.path.join(folder, "images", "3.png"))
+    protocol = evaluate_run(output, progress=False)["protocol"]
+    assert protocol["lenses"] == "native"
+    assert protocol.get("pinhole_every") == (None if scene_is_other else EVERY)
 
 
 def test_a_training_through_a_lens_shows_pinhole_images_too(tmp_path):

@@ -120,17 +120,36 @@ def test_few_photographs_train_for_fewer_iterations(tiny_scene, monkeypatch, vie
     """A training view is seen 300 times, but for the bounds, and for a budget below the scene's two for each point."""
     monkeypatch.setitem(NUMBERS, "cpu", Numbers(2, 10, 1000, 20, 100))
 
-    def chosen(*given, **options):
-        config = TrainConfig(scene=tiny_scene, strategy="importance", blend_mode="smoe", **options)
-        layout = read_layout(config)
-        return iterations_for_scene(config, given, dataclasses.replace(layout, train=layout.train[:1] * views))
+    def chosen(**options):
+        return iterations_with(tiny_scene, views, **options)
 
     assert chosen() == iterations
     assert chosen(batch=1000) == iterations, "a multiple of the batch"
     assert chosen(batch=16) == {15_000: 15_008, 18_000: 18_000, 30_000: 30_000}[iterations]
-    assert chosen(budget=200) == chosen("init_points", budget=288) == iterations, "as with the number that is chosen"
-    assert chosen(budget=199) == chosen("init_points", budget=287) == 30_000
-    assert chosen("iterations") == chosen("densify_until_iter") == 30_000
+    assert chosen(budget=200) == chosen(init_points=144, budget=288) == iterations, "as with the number that is chosen"
+    assert chosen(budget=199) == chosen(init_points=144, budget=287) == 30_000
+    assert chosen(iterations=30_000) == chosen(densify_until_iter=15_000) == 30_000
+
+
+def test_the_number_that_fewer_iterations_reach_trains_for_as_many_where_it_is_given(tiny_scene):
+    """144 points double at 1,000, 2,000 and 3,000, then growth ends; with 30,000 iterations seven times, to 7,000."""
+    options = {"densification_interval": 1000}
+    assert iterations_with(tiny_scene, 30, **options) == 15_000
+    layout = read_layout(TrainConfig(scene=tiny_scene))
+    shorter = TrainConfig(strategy="importance", blend_mode="smoe", iterations=15_000, densify_until_iter=7500,
+                          densify_from_iter=250, **options)
+    chosen = chosen_for_scene(shorter, options, layout)["budget"]
+    assert chosen == 144 * 2**3 < NUMBERS["cpu"].least
+    assert iterations_with(tiny_scene, 30, budget=chosen, **options) == 15_000
+    assert iterations_with(tiny_scene, 30, budget=chosen - 1, **options) == 30_000
+    assert iterations_with(tiny_scene, 30, budget=chosen + 1, **options) == 30_000, "15,000 do not reach it"
+
+
+def iterations_with(scene_folder, views, **options):
+    """Chosen for a scene with so many training views."""
+    options = {"scene": scene_folder, "strategy": "importance", "blend_mode": "smoe", **options}
+    layout = read_layout(TrainConfig(**options))
+    return iterations_for_scene(options, dataclasses.replace(layout, train=layout.train[:1] * views))
 
 
 def test_the_milestones_follow_the_chosen_iterations(tiny_scene, tmp_path, capsys, monkeypatch):
