@@ -55,7 +55,7 @@ Further options
   --background-gate X of smoe and smoe_eq7. Default: that of the .ply, else 0
   --background R,G,B  colour behind the Gaussians, 0 to 1. Default: 0,0,0
   --antialiasing      for models that were trained with it
-  --device NAME       cpu or cuda. Default: cuda where this build has it, else cpu
+  --device NAME       cpu or cuda. Default: cuda where this build has it, else cpu, as for panoramas
   --threads N         on the CPU. Default: all processors
   --fps X             frames a second of a video. Default: 30
 
@@ -250,13 +250,18 @@ std::vector<std::string> picture_paths(const fs::path& folder, const std::vector
   return paths;
 }
 
-std::unique_ptr<Renderer> make_renderer(const CommandLine& line, const Model& model, RenderOptions options) {
+std::unique_ptr<Renderer> make_renderer(const CommandLine& line, const Model& model, const std::vector<View>& views,
+                                        RenderOptions options) {
   const std::vector<double> background = line.numbers("background", {0, 0, 0}, 3);
   for (int c = 0; c < 3; ++c) options.background[c] = static_cast<float>(background[c]);
   options.antialiasing = line.has("antialiasing");
   const int processors = static_cast<int>(std::max(1u, std::thread::hardware_concurrency()));
   options.num_threads = line.whole("threads", processors, 1, 4096);
-  const std::string device = line.choice("device", has_cuda_renderer() ? "cuda" : "cpu", {"cpu", "cuda"});
+  const bool panorama = std::any_of(views.begin(), views.end(), [](const View& view) {
+    return view.model == LensModel::kEquirectangular;  // only the CPU's renderer closes its seam
+  });
+  const std::string device = line.choice("device", has_cuda_renderer() && !panorama ? "cuda" : "cpu", {"cpu", "cuda"});
+  if (panorama && device == "cuda") throw UsageError("--device is \"cuda\"; panoramas are rendered by cpu");
   return device == "cuda" ? make_cuda_renderer(model, options) : make_cpu_renderer(model, options);
 }
 
@@ -301,7 +306,7 @@ int run(int argc, char** argv) {
   for (const std::string& path : paths) {
     if (!is_picture) line.check_output(path, output);
   }
-  const std::unique_ptr<Renderer> renderer = make_renderer(line, model, options);
+  const std::unique_ptr<Renderer> renderer = make_renderer(line, model, views, options);
   Painter paint(show, format == "exr" && !is_video);
   std::unique_ptr<VideoFile> video;
   if (is_video) video = std::make_unique<VideoFile>(output, views[0].width, views[0].height, frames_per_second);

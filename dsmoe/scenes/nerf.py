@@ -62,7 +62,7 @@ def read_transforms_layout(folder: str, config: TrainConfig) -> Layout:
     if points is not None and not isinstance(points, str):
         raise SceneError(f"{path}: `ply_file_path` is {reprlib.repr(points)}; it must be the name of a file")
     if points is not None:
-        return Layout("transforms", train, test, _read_points(os.path.join(folder, points)), split)
+        return Layout("transforms", train, test, _read_points(_below(folder, points)), split)
     cameras = [image.camera for image in images]
     middle = orbit_of_cameras(cameras).target
     farthest = max(float(np.linalg.norm(camera.center - middle)) for camera in cameras)
@@ -138,9 +138,15 @@ def _read_json(path: str) -> Dict[str, Any]:
     return content
 
 
+def _below(folder: str, name: str) -> str:
+    """The path of a name in the file, which a program on Windows may have written."""
+    path = os.path.join(folder, name)
+    return path if is_file(path) else os.path.join(folder, name.replace("\\", "/"))
+
+
 def _image_path(folder: str, name: str) -> str:
     """A path without an ending gets the ending of the file that is there, else .png."""
-    path = os.path.join(folder, name)
+    path = _below(folder, name)
     if os.path.splitext(path)[1]:
         return path
     return next((path + ending for ending in (".png", ".jpg", ".jpeg") if is_file(path + ending)), path + ".png")
@@ -209,9 +215,9 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
     mask = frame.get("mask_path")
     if mask is None or not is_there:
         return PosedImage(camera, image_path, lens=lens)
-    if not isinstance(mask, str) or not is_file(os.path.join(folder, mask)):
+    if not isinstance(mask, str) or not is_file(_below(folder, mask)):
         raise SceneError(f"{where}: `mask_path` is {reprlib.repr(mask)}: no such file")
-    return PosedImage(camera, image_path, os.path.join(folder, mask), lens)
+    return PosedImage(camera, image_path, _below(folder, mask), lens)
 
 
 def _lens(model: Any, is_fisheye: bool, coefficients: Dict[str, float], where: str) -> Optional[Lens]:

@@ -98,5 +98,27 @@ TEST(Renderer, MapsGatesOnlyWhereTheyAreWanted) {
   }
 }
 
+TEST(Renderer, NamesTheGaussiansOnBothSidesOfAPanoramasSeam) {
+  Model model = make_model(1);
+  Orbit orbit;
+  orbit.distance = 4, orbit.elevation = 0;
+  orbit.width = 64, orbit.height = 32;
+  View view = orbit_views(orbit)[0];
+  set_panorama(view);
+  const Camera<float> camera = camera_of(view);
+  // Twice as far away from the orbit's middle as the camera is: straight behind it.
+  for (int k = 0; k < 3; ++k) model.means3D[k] = 2 * camera.position[k];
+  model.scales = {0.5f, 0.5f, 0.5f}, model.rotations = {1, 0, 0, 0}, model.opacities = {0.9f};
+  const Images images = make_cpu_renderer(model, options_of(BlendMode::kAlpha))->render(view);
+  const int row = 16 * images.width;
+  for (const int column : {0, 1, images.width - 2, images.width - 1}) {
+    EXPECT_EQ(images.gaussians[row + column], 0);
+    EXPECT_EQ(images.counts[row + column], 1);
+    EXPECT_NEAR(images.depth[row + column], 4, 1e-4);
+    EXPECT_NEAR(images.alpha[row + column], images.alpha[row + images.width - 1 - column], 1e-5);
+  }
+  EXPECT_EQ(images.gaussians[row + images.width / 2], -1);
+}
+
 }  // namespace
 }  // namespace dsmoe::tools

@@ -12,7 +12,13 @@ import pytest
 import torch
 from PIL import Image
 
-from diff_smoe_rasterization import io, rasterize, settings_from_camera
+from diff_smoe_rasterization import (
+    blend_footprints,
+    io,
+    project_gaussians,
+    rasterize,
+    settings_from_camera,
+)
 from diff_smoe_rasterization.gaussians import activate
 from diff_smoe_rasterization.settings import GATED_MODES
 
@@ -115,6 +121,35 @@ def test_all_camera_files_mean_the_same_view(tmp_path, kind):
     assert [path.name for path in files] == ["view.png"]
     actual = np.asarray(Image.open(files[0]).convert("RGB")).astype(int)
     assert np.abs(actual - levels(package_rendering(gaussians, "alpha", None).color)).max() <= LEVELS
+
+
+@pytest.mark.parametrize("mode, gate", MODES)
+def test_a_panorama_has_no_seam(tmp_path, mode, gate):
+    gaussians = model(mode, gate)
+    io.write_gaussians(tmp_path / "model.ply", gaussians)
+    size, position = (96, 48), np.array([0.1, -0.2, 0.3])  # in the middle of the Gaussians
+    matrix = np.diag([1.0, -1.0, -1.0, 1.0])
+    matrix[:3, 3] = position
+    (tmp_path / "transforms.json").write_text(json.dumps({
+        "camera_model": "EQUIRECTANGULAR", "w": size[0], "h": size[1],
+        "frames": [{"file_path": "view.png", "transform_matrix": matrix.tolist()}]}))
+    words = [tmp_path / "model.ply", "--cameras", tmp_path / "transforms.json", "--view", 0]
+    tool("dsmoe_render", *words, "-o", tmp_path / "out.png")
+    options = {"background_gate": gate} if mode in GATED_MODES else {}
+    settings = settings_from_camera(None, np.eye(3), -position, *size, sh_degree=2, blend_mode=mode,
+                                    camera_model="equirectangular", **options)
+    values = [torch.from_numpy(np.asarray(array)) for array in (gaussians.opacity_logits, gaussians.log_scales,
+                                                                gaussians.rotations)]
+    opacities, scales, rotations = activate(*values)
+    footprints = project_gaussians(torch.from_numpy(gaussians.means3D), opacities, settings, scales=scales,
+                                   rotations=rotations, dc=torch.from_numpy(gaussians.dc),
+                                   shs=torch.from_numpy(gaussians.shs))
+    seam = levels(blend_footprints(footprints, settings).color)
+    expected = levels(blend_footprints(footprints.around(size[0]), settings).color)
+    actual = np.asarray(Image.open(tmp_path / "out.png").convert("RGB")).astype(int)
+    assert np.abs(actual - expected).max() <= LEVELS < np.abs(seam - expected).max()
+    said = tool("dsmoe_render", *words, "--device", "cuda", "-o", tmp_path / "no.png", status=2)
+    assert "panoramas are rendered by cpu" in said
 
 
 def test_no_name_in_a_file_leads_out_of_the_folder(tmp_path):

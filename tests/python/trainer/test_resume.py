@@ -327,12 +327,13 @@ def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, mon
 
 
 def test_other_options_cannot_be_resumed(tiny_config):
-    train(tiny_config, progress=False)
-    words = r"--seed is 0, not 1\. `dsmoe train --resume -o .*/out` keeps the run's options"
+    config = dataclasses.replace(tiny_config, output=f"{tiny_config.output} of mine")
+    train(config, progress=False)
+    words = r"--seed is 0, not 1\. `dsmoe train --resume -o '.*/out of mine'` keeps the run's options"
     with pytest.raises(TrainerError, match=words):
-        train(dataclasses.replace(tiny_config, seed=1), resume=True, progress=False)
+        train(dataclasses.replace(config, seed=1), resume=True, progress=False)
     with pytest.raises(TrainerError, match="--blend-mode"):
-        train(tiny_config.changed(blend_mode="alpha"), resume=True, progress=False)
+        train(config.changed(blend_mode="alpha"), resume=True, progress=False)
 
 
 def test_a_run_is_not_overwritten_unasked(tiny_config):

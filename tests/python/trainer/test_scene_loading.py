@@ -646,6 +646,24 @@ def test_an_image_that_is_listed_twice(any_scene, again):
     refused(folder, "is listed twice", "to train on or to test")
 
 
+def test_names_that_windows_wrote_are_found(transforms_folder):
+    io.write_points(str(transforms_folder / "images" / "points.ply"), io.Points(np.eye(4)[:, :3]))
+    Image.new("L", (20, 10), 255).save(transforms_folder / "images" / "mask of one.png")
+    names = [frame["file_path"] for frame in json.loads((transforms_folder / "transforms.json").read_text())["frames"]]
+
+    def edit(content):
+        for frame, name in zip(content["frames"], names):
+            frame["file_path"] = name.replace("/", "\\")
+        content["frames"][1]["mask_path"] = "images\\mask of one.png"
+        content.update(ply_file_path="images\\points.ply", test_filenames=[names[0].replace("/", "\\")])
+
+    edit_json(transforms_folder / "transforms.json", edit)
+    scene = load(transforms_folder)
+    assert len(scene.points.positions) == 4 and [view.camera.name for view in scene.test] == names[:1]
+    assert [view.camera.name for view in scene.train] == names[1:]
+    assert [view.mask is not None for view in scene.train[:2]] == [True, False]
+
+
 def test_an_image_in_both_lists_of_transforms(transforms_folder):
     names = [f"images/frame_{index:05d}.jpg" for index in range(10)]
     edit_json(transforms_folder / "transforms.json", lambda content: content.update(
