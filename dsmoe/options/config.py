@@ -89,7 +89,7 @@ class TrainConfig:
               "in smoe_eq7)")
     iterations: int = _option(
         30_000, "views to train on, a view each step; with --batch B, B each step. importance takes fewer for few "
-                "photographs, unless the budget is below the number that it would choose")
+                "photographs, unless the budget is below the number that it would choose or above what they reach")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
     resolution: int = _option(
