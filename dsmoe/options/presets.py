@@ -98,7 +98,7 @@ def chosen_for_scene(config: TrainConfig, given: Collection[str], layout: Layout
         return {} if config.budget else {"budget": read_start(config.init).count}
     points = _points(config, given, layout)
     chosen: Dict[str, Any] = {}
-    if points < len(layout.points.subset(config.init_points, config.seed).positions):
+    if points < layout.points.size_of_subset(config.init_points):
         chosen["init_points"] = points
     if not config.budget:
         chosen["budget"] = min(_number(config, layout, points), reached_from(config, points))
@@ -107,7 +107,7 @@ def chosen_for_scene(config: TrainConfig, given: Collection[str], layout: Layout
 
 def _points(config: TrainConfig, given: Collection[str], layout: Layout) -> int:
     """How many points to start from."""
-    points = len(layout.points.subset(config.init_points, config.seed).positions)
+    points = layout.points.size_of_subset(config.init_points)
     bounded = layout.points.measured and "init_points" not in given
     return min(points, NUMBERS[config.device].most_points) if bounded else points
 

@@ -20,9 +20,13 @@ class PointCloud:
     colors: np.ndarray  # [N, 3] float64 in [0, 1]
     measured: bool = True  # of the scene; False: random ones, whose number says nothing of it
 
+    def size_of_subset(self, count: int) -> int:
+        """How many points `subset` of this count gives."""
+        return min(count or len(self.positions), len(self.positions))
+
     def subset(self, count: int, seed: int) -> PointCloud:
         """A random choice of `count` points, in their original order; all of them if there are no more."""
-        if count == 0 or count >= len(self.positions):
+        if self.size_of_subset(count) == len(self.positions):
             return self
         chosen = np.sort(np.random.RandomState(seed).choice(len(self.positions), count, replace=False))
         return dataclasses.replace(self, positions=self.positions[chosen], colors=self.colors[chosen])

@@ -23,7 +23,10 @@ Map = Tuple[torch.Tensor, torch.Tensor]
 
 
 def pinhole_every(views: Sequence[View], iterations: int) -> int:
-    """Of how many views of a training on these one is shown by a pinhole; 0: none is."""
+    """Of how many views of a training on these one is shown by a pinhole; 0: none is.
+
+    The last step of a training changes nothing, so a training of one step shows none.
+    """
     return EVERY if iterations > 1 and any(_is_bent(view.camera) for view in views) else 0
 
 
