@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from dsmoe.distributed.batch import rounds_of
 from dsmoe.distributed.trainer import BatchTrainer
 from dsmoe.errors import ConfigError, TrainerError
 from dsmoe.options.config import LEARNED, GateOptions
@@ -93,6 +94,12 @@ def test_the_rate_of_the_gate_follows_the_same_rule(batch):
     before = float(gate.logarithm)
     gate.step()
     assert float(gate.logarithm) - before == pytest.approx(-0.03 * batch**0.5, rel=1e-5)
+
+
+def test_who_had_a_large_view_takes_a_small_one():
+    """Views 0 to 4, of 5, 1, 9, 7 and 3 rows, over two processes; a single round has them in their order."""
+    assert rounds_of([5, 1, 9, 7, 3], 2) == [{0: 2, 1: 3}, {1: 0, 0: 4}, {0: 1}]
+    assert rounds_of([5, 9], 2) == [{0: 0, 1: 1}]
 
 
 def test_milestones_count_views(tiny_config, scene):

@@ -22,7 +22,7 @@ from dsmoe.train import train
 from dsmoe.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
 from dsmoe.training.passes import add_gradient
 from dsmoe.training.room import gaussian_bytes
-from dsmoe.training.strategy import Look, Step
+from dsmoe.training.strategy import Look, Step, look_at
 from dsmoe.training.trainer import Trainer
 
 
@@ -240,6 +240,21 @@ def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
     # float32 images; a pixel's squared change is of their last digits' size nowhere that matters.
     assert float(strategy.costs[index]) == pytest.approx(float(cost), rel=1e-4)
     assert 0.2 * float(error) < float(strategy.errors.sum()) <= float(error) * (1 + 1e-5)
+
+
+def test_a_look_counts_pixels_as_the_mask_does(tiny_config):
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
+    view = trainer.scene.train[0]
+    mask = torch.zeros_like(view.image[:1])
+    mask[:, :, :16] = 51  # a fifth
+    with torch.no_grad():
+        rendering, splats = trainer.renderer.with_splats(view.camera)
+    weights = mask[0] / 255
+    error = weights * (rendering.color - view.image_float()).square().sum(0)
+    expected = splats.importance(weights, error)
+    found = look_at(dataclasses.replace(view, mask=mask), view.image, rendering.color, splats)
+    assert (found.costs == 0).any() and (found.costs > 0).any()
+    torch.testing.assert_close(found, Look(expected.removal_costs, expected.shares))
 
 
 def test_rates_of_gate_fall_behind_the_moves(tiny_config):
@@ -527,6 +542,22 @@ def test_mcmc_regularises_opacities_and_scales(tiny_config, views):
         trainer.strategy.after_backward(SimpleNamespace(batch=views, add_gradient=partial(add_gradient, trainer.model)))
     torch.testing.assert_close(raw["opacities"].grad, gradients[0])
     torch.testing.assert_close(raw["scales"].grad, gradients[1])
+
+
+def test_more_copies_than_have_digits_are_taken_as_fifty():
+    new, factor = divided(torch.full((2,), 0.9), torch.tensor([50, 80]))
+    assert new[0] == new[1] and factor[0] == factor[1] and torch.isfinite(factor).all()
+
+
+def test_who_makes_room_for_many_stays_alive(tiny_config):
+    """As the paper has it: of 50 copies of an opacity of 0.01 each would have 0.0002."""
+    trainer = trainer_of(tiny_config, strategy="mcmc", budget=300)
+    with torch.no_grad():
+        trainer.model.raw["opacities"].fill_(torch.logit(torch.tensor(0.01)))
+        trainer.model.raw["opacities"][1:50] = torch.logit(torch.tensor(0.001))
+        trainer.model.raw["opacities"][50:] = -math.inf
+        trainer.strategy.relocate()
+    assert float(trainer.model.opacities.detach().min()) == pytest.approx(0.005, rel=1e-5)
 
 
 def test_noise_shakes_the_faint_only(tiny_config):
