@@ -6,7 +6,7 @@ import numpy as np
 from diff_smoe_rasterization.io import Gaussians
 
 from ..scenes.pointcloud import SH_C0
-from .shown import logits, rotatable_rows
+from .shown import logits, rotatable_rows, sigmoid
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
@@ -19,7 +19,7 @@ def splat_bytes(gaussians: Gaussians) -> bytes:
     whose quaternion is 0, which viewers cannot turn into a rotation. Raises TrainerError if none is left.
     """
     position, logit, log_scales, rotations, dc, _ = rotatable_rows(gaussians)
-    opacity = 1 / (1 + np.exp(-logit.astype(np.float64)))
+    opacity = sigmoid(logit)
     scale = np.exp(log_scales.astype(np.float64))
     colour = 0.5 + SH_C0 * dc.astype(np.float64)
     quaternion = rotations / np.linalg.norm(rotations.astype(np.float64), axis=1, keepdims=True)

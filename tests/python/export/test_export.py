@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import struct
+import warnings
 
 import numpy as np
 import pytest
@@ -72,6 +73,13 @@ def test_a_splat_file_has_32_bytes_a_gaussian_the_largest_first(model, tmp_path,
 def test_a_splat_file_leaves_out_what_no_viewer_can_show(arrays):
     whole = splat_bytes(gaussians())
     assert splat_bytes(gaussians(**arrays)) == whole[:32], "the second, which is first in the file"
+
+
+def test_an_opacity_of_nothing_is_no_overflow_of_a_splat_file():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        records = np.frombuffer(splat_bytes(gaussians(opacity_logits=[[1000], [-1000]])), np.uint8).reshape(-1, 32)
+    assert records[:, 27].tolist() == [255, 0]
 
 
 def test_a_model_without_gaussians_is_an_empty_page(tmp_path):
