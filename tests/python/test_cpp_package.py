@@ -120,6 +120,30 @@ def test_a_strangers_project_uses_what_cmake_installs(tmp_path):
     run(tmp_path / "consumer" / "consumer_torch")
 
 
+@needs_cmake
+@pytest.mark.parametrize("library_folder", ["lib", "lib/triplet"])
+def test_what_is_installed_finds_the_shared_libraries_beside_it(tmp_path, library_folder):
+    """By the folders that CMake's file API says it installs to, and the linker's words for where a program looks."""
+    reply = tmp_path / ".cmake" / "api" / "v1" / "reply"
+    query = reply.parent / "query" / "codemodel-v2"
+    query.parent.mkdir(parents=True)
+    query.touch()
+    run("cmake", "-S", ROOT, "-B", tmp_path, "-DBUILD_SHARED_LIBS=ON", "-DDSMOE_CUDA=OFF", "-DDSMOE_BUILD_TESTS=OFF",
+        "-DCMAKE_BUILD_WITH_INSTALL_RPATH=ON", f"-DCMAKE_INSTALL_LIBDIR={library_folder}")
+    linked = set()
+    for path in reply.glob("target-*.json"):
+        target = json.loads(path.read_text())
+        if "install" not in target:
+            continue
+        folder = target["install"]["destinations"][0]["path"]
+        words = " ".join(fragment["fragment"] for fragment in target["link"]["commandFragments"])
+        looks = [os.path.normpath(folder + rest)
+                 for rest in re.findall(r"(?:ORIGIN|loader_path)([\w./-]*)", words)]
+        assert library_folder in looks, (target["name"], words)
+        linked.add(target["name"])
+    assert {"dsmoe_core", "dsmoe_io"} <= linked  # and the tools, where there is OpenCV
+
+
 def what_is_found(folder, asked, absent="", before="", prefixes=""):
     """Whether find_package finds this package without the package `absent`, and the targets that come of it."""
     (folder / "CMakeLists.txt").write_text(f"""cmake_minimum_required(VERSION 3.21)
