@@ -375,7 +375,8 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
 
     trained = open_trained(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
                            arguments.faint_below, **overrides)
-    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
+    given = {name: value for name, value in vars(arguments).items() if name in ("frames", "fps")}
+    print(film(trained, arguments.output, outputs=outputs, overwrite=arguments.overwrite, **given))
 
 
 def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
@@ -389,12 +390,12 @@ def _export(arguments: argparse.Namespace) -> None:
 
     if arguments.bake:
         _choose_device(arguments)
+    given = {name: value for name, value in vars(arguments).items() if name == "bake_iterations"}
     with PromptInterrupt():
         path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
                                arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
-                               bake=arguments.bake, bake_iterations=arguments.bake_iterations,
-                               device=arguments.device if arguments.bake else "cpu", faint_below=arguments.faint_below,
-                               **_overrides(arguments))
+                               bake=arguments.bake, device=arguments.device if arguments.bake else "cpu",
+                               faint_below=arguments.faint_below, **given, **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

@@ -7,7 +7,7 @@ import shlex
 
 from ..errors import ConfigError, SceneError, TrainerError
 from ..system.files import check_output, is_file, is_folder
-from .choices import MODEL
+from .choices import MODEL, ORBIT_FRAMES, VIDEO_FPS
 from .config import TrainConfig, holds_run
 from .config_arguments import given_options
 
@@ -32,12 +32,24 @@ def check_early(arguments: argparse.Namespace) -> None:
         check_model(arguments.model)
         if holds_run(arguments.model):
             TrainConfig.load(arguments.model)
+        _check_meant(arguments)
         if command == "render" and arguments.orbit:
-            check_orbit(arguments.frames, arguments.fps)
+            check_orbit(getattr(arguments, "frames", ORBIT_FRAMES), getattr(arguments, "fps", VIDEO_FPS))
         if command == "export" and arguments.output:
             check_output(arguments.output, arguments.overwrite)
     if command in ("simplify", "eval", "render", "export", "view") and scene:
         check_scene(scene)
+
+
+def _check_meant(arguments: argparse.Namespace) -> None:
+    """Raises TrainerError for an option that would do nothing."""
+    for name, other, typed in (("frames", "orbit", "--orbit"), ("fps", "orbit", "--orbit"),
+                               ("bake_iterations", "bake", "--bake alpha")):
+        if hasattr(arguments, name) and not getattr(arguments, other):
+            raise TrainerError(f"--{name.replace('_', '-')} means something with {typed} alone; add that, or leave it "
+                               "out")
+    if getattr(arguments, "orbit", False) and arguments.split:
+        raise TrainerError("--split names cameras of the scene, and --orbit has its own; leave out one of the two")
 
 
 def _check_options(arguments: argparse.Namespace) -> None:

@@ -205,7 +205,11 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         f"eval|{ply}": f"`dsmoe render {ply} --scene SCENE -o IMAGES` renders",
         "eval|my model": "`dsmoe render 'my model' --scene", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
         f"render|{ply}|-o|o|--scene|nowhere": "scene nowhere: no such folder", "view|nowhere": "no such file or folder",
-        "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it"}
+        "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it",
+        f"render|{ply}|-o|o|--frames|3": "--frames means something with --orbit alone",
+        f"render|{ply}|-o|o|--fps|3": "--fps means something with --orbit alone",
+        f"render|{ply}|-o|o|--orbit|--split|test": "leave out one of the two",
+        f"export|{ply}|--bake-iterations|3": "--bake-iterations means something with --bake alpha alone"}
     listed = {"": "measure a trained run again", "patch": "take the patch out of every file",
               "bench": "run what is not done yet of a suite"}
     package = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))
@@ -221,10 +225,17 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
 @pytest.mark.parametrize("words, error", [
     ("train s -o o --iterations 1e4", "argument --iterations: is '1e4'; it must be a whole number\n"),
     ("train s -o o --opacity-lr 0,1", "argument --opacity-lr: is '0,1'; it must be a number\n"),
-    ("view o --port 80x", "argument --port: is '80x'; it must be a whole number\n")])
-def test_what_is_no_number_is_told(words, error, capsys):
+    ("view o --port 80x", "argument --port: is '80x'; it must be a whole number\n"),
+    *((words, f"argument {name}: is empty; name a file or folder\n") for words, name in (
+        ("export m.ply -o ''", "-o/--output"), ("render m.ply -o ''", "-o/--output"), ("view ''", "MODEL"),
+        ("simplify m.ply --budget 9 -o ''", "-o/--output"), ("train '' -o o", "SCENE"), ("eval ''", "OUT"),
+        ("train s -o ''", "-o/--output"), ("scene p -o ''", "-o/--output"), ("scene '' -o o", "PHOTOS"),
+        ("bench run smoke -o ''", "-o/--output"), ("bench report r -o ''", "-o/--output"),
+        ("bench run ''", "SUITE"), ("bench report ''", "RESULTS"), ("patch check ''", "PATH"),
+        ("eval o --scene ''", "--scene"), ("render m.ply -o o --scene ''", "--scene")))])
+def test_what_is_no_number_or_no_name_is_told(words, error, capsys):
     with pytest.raises(SystemExit):
-        main(words.split())
+        main(shlex.split(words))
     assert capsys.readouterr().err.endswith(error)
 
 
