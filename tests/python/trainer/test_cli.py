@@ -17,6 +17,7 @@ from io import BytesIO, TextIOWrapper
 import numpy as np
 import pytest
 import torch
+import unprivileged
 from PIL import Image
 
 import diff_smoe_rasterization
@@ -671,9 +672,6 @@ def test_resume_of_a_folder_alone_has_the_options_of_the_run(trained, tmp_path, 
         main(["train", "-o", output])
     assert "SCENE and -o OUT are needed" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["train", "scene", "-o", ""])  # as of a shell's variable that is not set
-    assert "SCENE and -o OUT are needed" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
         main(["train", "--resume", output, "--scale-recipe"])
     assert "--scale-recipe needs SCENE" in capsys.readouterr().err
 
@@ -726,8 +724,27 @@ def test_an_output_that_cannot_be_written_is_one_line(trained, scene, tmp_path, 
     with open(path, "w", encoding="utf-8") as file:
         file.write("no folder")
     for arguments in (["train", scene, "-o", path], ["train", scene, "-o", os.path.join(path, "below")],
-                      ["render", trained, "-o", path]):
-        assert path in fails(capsys, *arguments)
+                      ["render", trained, "-o", path], ["simplify", trained, "--budget", "9", "-o", path],
+                      ["scene", os.path.join(scene, "images"), "-o", path],
+                      ["export", trained, "-o", os.path.join(path, "a.ply")],
+                      ["render", trained, "--orbit", "-o", os.path.join(path, "a.gif")]):
+        assert f"{path} is no folder; choose another name with -o" in fails(capsys, *arguments)
+
+
+def test_a_folder_that_may_not_be_written_or_read_is_told_before_anything_is_made(trained, scene, tmp_path):
+    locked, photos = tmp_path / "locked", tmp_path / "photos"
+    shutil.copytree(os.path.join(scene, "images"), str(photos))
+    (photos / "more").mkdir(mode=0)
+    locked.mkdir(mode=0o500)
+    for words in (["train", scene, "-o", locked / "new"], ["render", trained, "-o", locked],
+                  ["render", trained, "--orbit", "-o", locked / "a.gif"], ["export", trained, "-o", locked / "a.ply"],
+                  ["simplify", trained, "--budget", "9", "-o", locked / "a" / "b"]):
+        done = unprivileged.dsmoe(*words)
+        assert (done.returncode, done.stdout) == (1, "") and done.stderr.endswith(
+            f"{words[-1]}: nothing can be written there: you may not write in {locked}; choose another name with -o\n")
+    done = unprivileged.dsmoe("scene", photos, "-o", tmp_path / "made")
+    assert done.returncode == 1 and f"{photos / 'more'}: photographs there cannot be read" in done.stderr
+    assert sorted(os.listdir(tmp_path)) == ["locked", "photos"] and not os.listdir(locked)
 
 
 def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
