@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from comparison import assert_all_close, assert_close
+from devices import on_the_cpu
 from lens_scenes import (
     GRID,
     LENSES,
@@ -18,13 +19,14 @@ from lens_scenes import (
     projected,
     shape_error,
 )
-from scenes import gradients, op_arguments, random_scene, turned
+from scenes import Scene, gradients, op_arguments, random_scene, turned
 
 from diff_smoe_rasterization import (
     GaussianRasterizer,
     blend_footprints,
     project_gaussians,
     rasterize,
+    reference,
     settings_from_camera,
     visible_radii,
 )
@@ -125,6 +127,27 @@ def test_footprints_are_those_of_brute_force(model, distortion, shutter):
         still_errors.append(shape_error(projected(means[i:i + 1], axes[i:i + 1], still)[1][0], covariance))
     assert max(errors) < 0.01
     assert np.median(still_errors) > 0.05
+
+
+@pytest.mark.parametrize("shutter, seen", [("left_to_right", False), ("right_to_left", True)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_point_that_crosses_the_seam_against_the_shutter_is_never_seen(shutter, seen, dtype):
+    """The camera turns by 0.2, and a point goes at t = 0.25 from column 62.99 to the left border, to 1.03 at t = 1.
+
+    From left to right the last column is read at t = 1 and the first at t = 0; the point then is at the other side.
+    """
+    scene = rolling_scene("smoe", "equirectangular", shutter).to(dtype)
+    view = torch.eye(4).to(scene.settings.viewmatrix)
+    settings = scene.settings._replace(image_width=64, image_height=32, viewmatrix=view, campos=torch.zeros_like(
+        scene.settings.campos), viewmatrix_end=turned(view, (0, 0.2, 0), (0, 0, 0)))
+    longitude = math.pi - 0.05
+    inputs = {name: tensor[:1] for name, tensor in scene.inputs.items()}
+    inputs["means3D"] = 2 * view.new_tensor([[math.sin(longitude), 0, math.cos(longitude)]])
+    inputs["scales"] = torch.full_like(inputs["scales"], 0.05)
+    assert (rasterize(settings=settings, **inputs).radii > 0).tolist() == [seen]
+    with on_the_cpu():
+        on_cpu = Scene(inputs, settings).to("cpu")
+        assert (reference.rasterize(settings=on_cpu.settings, **on_cpu.inputs).radii > 0).tolist() == [seen]
 
 
 def test_both_halves_of_a_rendering():
