@@ -21,6 +21,7 @@ import unprivileged
 from PIL import Image
 
 import diff_smoe_rasterization
+import dsmoe.__main__
 from diff_smoe_rasterization import io
 from dsmoe import cli, inspection
 from dsmoe.cli import main
@@ -866,6 +867,15 @@ def test_names_that_a_terminal_cannot_print_end_no_command(scene, tmp_path, monk
     out, errors = (stream.buffer.read() for stream in streams)
     assert (b"export 'run\xff' -o" if encoding == "utf-8" else b"export 'run\\udcff' -o") in out
     assert errors.count(b"\n") == 2 and b"a\\udcff holds no config.json" in errors
+
+
+def test_an_interruption_while_the_command_is_loaded_shows_no_traceback(monkeypatch, capsys):
+    class Interrupted:
+        def __getattr__(self, name):
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "dsmoe.cli", Interrupted())
+    assert dsmoe.__main__.main() == 130 and capsys.readouterr().err == "\ndsmoe: interrupted\n"
 
 
 def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):
