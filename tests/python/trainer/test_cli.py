@@ -829,6 +829,22 @@ def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, mon
             assert mine.read() == theirs.read()
 
 
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_an_interrupted_rendering_leaves_whole_images(trained, tmp_path, monkeypatch, ctrl_c_works, number, status):
+    words, save = ["render", trained, "-o", str(tmp_path)], Image.Image.save
+
+    def interrupted_save(self, file, **options):
+        save(self, file, **options)
+        if (tmp_path / "view_000.png").exists():  # the second one is not whole yet
+            os.kill(os.getpid(), number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Image.Image, "save", interrupted_save)
+        assert main(words) == status
+    assert sorted(os.listdir(tmp_path)) == [".dsmoe.json", ".dsmoe.lock", "view_000.png"]
+    assert main(words) == 0 and "view_008.png" in os.listdir(tmp_path)
+
+
 def test_names_of_images_need_not_be_utf_8(scene, tmp_path, capsys):
     """One of the training and one of the test, as an old camera's disk has them: each command takes them."""
     folder, output = str(tmp_path / "scene"), str(tmp_path / "out")
