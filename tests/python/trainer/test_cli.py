@@ -732,6 +732,15 @@ def test_an_output_that_cannot_be_written_is_one_line(trained, scene, tmp_path, 
         assert f"{path} is no folder; choose another name with -o" in fails(capsys, *arguments)
 
 
+@pytest.mark.parametrize("words", [["info"], ["render", "o", "-o", "i"], ["bench", "run", "smoke"],
+                                   ["patch", "check", "p"]])
+def test_a_current_folder_that_is_gone_is_told(words, tmp_path, capsys, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert "the current folder has been removed; go to another one" in fails(capsys, *words)
+
+
 def test_a_folder_that_may_not_be_written_or_read_is_told_before_anything_is_made(trained, scene, tmp_path):
     locked, photos = tmp_path / "locked", tmp_path / "photos"
     shutil.copytree(os.path.join(scene, "images"), str(photos))
