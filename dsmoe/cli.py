@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import os
 import shlex
@@ -48,7 +49,8 @@ def main(argv: Optional[List[str]] = None) -> int:
     try:
         take_paper(arguments)
         check_early(arguments)
-        status = COMMANDS[arguments.command](arguments) or 0
+        with PromptInterrupt() if arguments.command in ("render", "export") else contextlib.nullcontext():
+            status = COMMANDS[arguments.command](arguments) or 0
         sys.stdout.flush()
         return status
     except BrokenPipeError:  # whoever read the output, such as `head`, has enough of it
@@ -391,11 +393,10 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.bake:
         _choose_device(arguments)
     given = {name: value for name, value in vars(arguments).items() if name == "bake_iterations"}
-    with PromptInterrupt():
-        path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
-                               arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
-                               bake=arguments.bake, device=arguments.device if arguments.bake else "cpu",
-                               faint_below=arguments.faint_below, **given, **_overrides(arguments))
+    path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
+                           arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
+                           bake=arguments.bake, device=arguments.device if arguments.bake else "cpu",
+                           faint_below=arguments.faint_below, **given, **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
@@ -33,7 +34,7 @@ from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_l
 from .scenes.straight import pinhole_every
 from .starting import find_model
 from .system.device import check_device
-from .system.files import is_file, is_folder, write_json_atomically
+from .system.files import is_file, is_folder, write_atomically, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.progress import progress_bar
 from .train import PER_VIEW_NAME
@@ -234,11 +235,13 @@ def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, sub
         paths = [os.path.join(folder, stem) for stem in stems]
         for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
             rendering = renderer(camera, outputs=tuple(outputs))
-            to_image(rendering.color).save(path + ".png")
+            write_atomically(path + ".png", partial(to_image(rendering.color).save, format="PNG"))
             if rendering.depth is not None:
-                np.save(path + endings["depth"], rendering.depth[0].cpu().numpy())
+                depth = rendering.depth[0].cpu().numpy()
+                write_atomically(path + endings["depth"], partial(np.save, arr=depth))
             if rendering.alpha is not None:
-                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path + endings["alpha"])
+                alpha = to_image(rendering.alpha.expand(3, -1, -1)).convert("L")
+                write_atomically(path + endings["alpha"], partial(alpha.save, format="PNG"))
     return [path + ".png" for path in paths]
 
 

@@ -21,6 +21,10 @@ LEAST_FPS, MOST_FPS = 0.01, 1000.0  # a .gif shows a frame for at most 655 s
 
 def check_early(arguments: argparse.Namespace) -> None:
     """Raises TrainerError as the command would, for what needs no torch to be seen. Not all of it is."""
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise TrainerError("the current folder has been removed; go to another one") from error
     command, scene = arguments.command, getattr(arguments, "scene", None)
     if command == "scene":
         check_photos(arguments.photos)

@@ -105,7 +105,8 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
         check_output(path, overwrite)
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename is not None and os.fsdecode(error.filename) == temporary:
+        named = error.filename is not None
+        if error.errno is not None and (not named or os.fsdecode(error.filename) == temporary):
             raise OSError(error.errno, error.strerror, path) from error
         raise
     finally:

@@ -165,7 +165,7 @@ def test_a_table_has_the_mean_and_the_deviation_of_its_rows():
             for blend, seed, psnr, ssim in (("alpha", 0, 30.0, 0.5), ("smoe", 1, 31.5, 0.75), ("alpha", 1, 32.0, 0.7),
                                             ("smoe", 0, 30.5, 0.85))]
     assert tables.budget_table(rows).splitlines()[2] == (
-        "| fox, 4,000 | 31.00±1.41 | 0.300 | 31.00±0.71 | 0.400 | +0.50, -0.50 | +0.00 |")
+        "| fox, 4,000 | 31.00±1.41, 0.300 | 31.00±0.71, 0.400 | +0.50, -0.50 | +0.00 |")
     assert tables.thousands([{"num_gaussians": 1_198_600}]) == "1,199k"
     assert tables.thousands([{"num_gaussians": 99_940}]) == "99.9k"
 

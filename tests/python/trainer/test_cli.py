@@ -21,6 +21,7 @@ import unprivileged
 from PIL import Image
 
 import diff_smoe_rasterization
+import dsmoe.__main__
 from diff_smoe_rasterization import io
 from dsmoe import cli, inspection
 from dsmoe.cli import main
@@ -731,6 +732,15 @@ def test_an_output_that_cannot_be_written_is_one_line(trained, scene, tmp_path, 
         assert f"{path} is no folder; choose another name with -o" in fails(capsys, *arguments)
 
 
+@pytest.mark.parametrize("words", [["info"], ["render", "o", "-o", "i"], ["bench", "run", "smoke"],
+                                   ["patch", "check", "p"]])
+def test_a_current_folder_that_is_gone_is_told(words, tmp_path, capsys, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert "the current folder has been removed; go to another one" in fails(capsys, *words)
+
+
 def test_a_folder_that_may_not_be_written_or_read_is_told_before_anything_is_made(trained, scene, tmp_path):
     locked, photos = tmp_path / "locked", tmp_path / "photos"
     shutil.copytree(os.path.join(scene, "images"), str(photos))
@@ -828,6 +838,22 @@ def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, mon
             assert mine.read() == theirs.read()
 
 
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_an_interrupted_rendering_leaves_whole_images(trained, tmp_path, monkeypatch, ctrl_c_works, number, status):
+    words, save = ["render", trained, "-o", str(tmp_path)], Image.Image.save
+
+    def interrupted_save(self, file, **options):
+        save(self, file, **options)
+        if (tmp_path / "view_000.png").exists():  # the second one is not whole yet
+            os.kill(os.getpid(), number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Image.Image, "save", interrupted_save)
+        assert main(words) == status
+    assert sorted(os.listdir(tmp_path)) == [".dsmoe.json", ".dsmoe.lock", "view_000.png"]
+    assert main(words) == 0 and "view_008.png" in os.listdir(tmp_path)
+
+
 def test_names_of_images_need_not_be_utf_8(scene, tmp_path, capsys):
     """One of the training and one of the test, as an old camera's disk has them: each command takes them."""
     folder, output = str(tmp_path / "scene"), str(tmp_path / "out")
@@ -866,6 +892,15 @@ def test_names_that_a_terminal_cannot_print_end_no_command(scene, tmp_path, monk
     out, errors = (stream.buffer.read() for stream in streams)
     assert (b"export 'run\xff' -o" if encoding == "utf-8" else b"export 'run\\udcff' -o") in out
     assert errors.count(b"\n") == 2 and b"a\\udcff holds no config.json" in errors
+
+
+def test_an_interruption_while_the_command_is_loaded_shows_no_traceback(monkeypatch, capsys):
+    class Interrupted:
+        def __getattr__(self, name):
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "dsmoe.cli", Interrupted())
+    assert dsmoe.__main__.main() == 130 and capsys.readouterr().err == "\ndsmoe: interrupted\n"
 
 
 def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):
