@@ -358,6 +358,7 @@ def rolling_points(points, settings):
 
     A point is seen at the time t for which its pixel, by the pose (1 - t) first + t last, is in the row read at t. The
     time is found by bisection. One step of Newton's method from there, which does not move it, gives it derivatives.
+    A point that crosses the seam of a panorama may be in no column when that is read: its depth is NaN.
     """
     axis = 0 if settings.rolling_shutter in ("left_to_right", "right_to_left") else 1
     sign = -1 if settings.rolling_shutter in ("bottom_to_top", "right_to_left") else 1
@@ -379,6 +380,7 @@ def rolling_points(points, settings):
         time = (low + high) / 2
         stands_still = (time < FIRST_TIME + 1e-9) | (time > LAST_TIME - 1e-9)
         time = time.masked_fill(time < FIRST_TIME + 1e-9, FIRST_TIME).masked_fill(time > LAST_TIME - 1e-9, LAST_TIME)
+        never = ~stands_still & (late(low) - late(high) > 1)  # bisection has found a jump of the place, and no zero
     with torch.enable_grad():
         moved = time.clone().requires_grad_()
         slope = torch.autograd.grad(late(moved).sum(), moved)[0]
@@ -388,7 +390,7 @@ def rolling_points(points, settings):
     # By the chain rule: the pixel p(x, t) also moves with the time t, which moves with p.
     velocity = jacobian @ motion[:, :, None]
     speed = length - sign * velocity[:, axis]
-    depth = depth.masked_fill(~stands_still & (speed[:, 0] < SHUTTER_SPEED_MIN * length), math.nan)
+    depth = depth.masked_fill(never | ~stands_still & (speed[:, 0] < SHUTTER_SPEED_MIN * length), math.nan)
     stretch = (sign * velocity @ jacobian[:, axis:axis + 1] / speed[:, None]).masked_fill(
         stands_still[:, None, None], 0)
     view, end = (matrix[:3, :3].T for matrix in (settings.viewmatrix, settings.viewmatrix_end))

@@ -25,6 +25,7 @@ from diff_smoe_rasterization import (
     blend_footprints,
     project_gaussians,
     rasterize,
+    reference,
     settings_from_camera,
     visible_radii,
 )
@@ -74,6 +75,20 @@ def test_a_camera_that_stands_still_has_the_image_of_a_global_shutter(shutter):
     end = found.pop("viewmatrix_end")
     found["viewmatrix"] += end
     assert_all_close(found, wanted, 1e-12)
+
+
+@pytest.mark.parametrize("shutter, sign", [("left_to_right", 1), ("right_to_left", -1)])
+def test_what_flees_across_the_seam_of_a_panorama_is_never_read(shutter, sign):
+    """Its column is 63.2 of 64 at first and -0.2 at last, or the mirror image: no column is read while it is there."""
+    x = 2 * math.tan(0.3 * math.pi / 32) * sign
+    settings = settings_from_camera(None, torch.eye(3), torch.zeros(3), 64, 32, camera_model="equirectangular",
+                                    rolling_shutter=shutter, end=(torch.eye(3), torch.tensor([-2 * x, 0.0, 0.0])))
+    arguments = dict(means3D=torch.tensor([[x, 0, -2.0], [5 * x, 0, -2]]), opacities=torch.full((2, 1), 0.9),
+                     settings=settings, colors_precomp=torch.ones(2, 3), scales=torch.full((2, 3), 0.05),
+                     rotations=torch.tensor([[1.0, 0, 0, 0]] * 2))
+    radii = rasterize(**arguments).radii
+    assert (radii > 0).tolist() == [False, True]
+    assert torch.equal(reference.rasterize(**arguments).radii, radii)
 
 
 @pytest.mark.parametrize("model, distortion", [("opencv", (-0.25, 0.06, 0.001, -0.002)),
