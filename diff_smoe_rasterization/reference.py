@@ -13,7 +13,7 @@ What the paper leaves open is decided here:
   definite, its pixel position, conic or colour is not finite, or its footprint misses the image.
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - With a camera model other than "pinhole", a Gaussian beyond its lens's range is culled too: see `lens_points`. With a
-  rolling shutter, so is one that moves about as fast as it: see `rolling_points`.
+  rolling shutter, so is one that moves about as fast as it, or is never where it reads: see `rolling_points`.
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `tail_sum`.
@@ -351,6 +351,7 @@ def positions_and_depths(view, settings):
 
 FIRST_TIME, LAST_TIME = -0.15, 1.15  # of a rolling shutter: 0 is the first row, or column, and 1 the last
 SHUTTER_SPEED_MIN = 0.1  # what moves with the shutter at more than 1 - this of its speed is culled
+TIME_ERROR_MAX = 0.1  # pixels between a point and the row that is read then; rounding is far below, a jump far above
 
 
 def rolling_points(points, settings):
@@ -358,7 +359,6 @@ def rolling_points(points, settings):
 
     A point is seen at the time t for which its pixel, by the pose (1 - t) first + t last, is in the row read at t. The
     time is found by bisection. One step of Newton's method from there, which does not move it, gives it derivatives.
-    A point that crosses the seam of a panorama may be in no column when that is read: its depth is NaN.
     """
     axis = 0 if settings.rolling_shutter in ("left_to_right", "right_to_left") else 1
     sign = -1 if settings.rolling_shutter in ("bottom_to_top", "right_to_left") else 1
@@ -380,7 +380,7 @@ def rolling_points(points, settings):
         time = (low + high) / 2
         stands_still = (time < FIRST_TIME + 1e-9) | (time > LAST_TIME - 1e-9)
         time = time.masked_fill(time < FIRST_TIME + 1e-9, FIRST_TIME).masked_fill(time > LAST_TIME - 1e-9, LAST_TIME)
-        never = ~stands_still & (late(low) - late(high) > 1)  # bisection has found a jump of the place, and no zero
+        never = ~stands_still & (late(time).abs() > TIME_ERROR_MAX)  # the point jumps over its row: at a seam
     with torch.enable_grad():
         moved = time.clone().requires_grad_()
         slope = torch.autograd.grad(late(moved).sum(), moved)[0]

@@ -38,7 +38,7 @@ class Splats:
 
     @property
     def depths(self) -> torch.Tensor:
-        """[N] distances from the camera along its axis, the view z."""
+        """[N] view z, or what `CAMERA_MODELS` has as the depth."""
         return self._of_visible(self._projected[:, 7])
 
     def contributions(self, pixel_weights: torch.Tensor) -> Contributions:

@@ -13,6 +13,7 @@ from PIL import Image
 from .errors import TrainerError, printable
 from .model import GaussianModel
 from .options.config import CHECKPOINT_NAME, LEARNED, TrainConfig, holds_run
+from .options.early import check_ending
 from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import (
@@ -26,7 +27,6 @@ from .results.modelfile import (
 from .results.pictures import file_names
 from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
-from .results.video import check_ending
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout

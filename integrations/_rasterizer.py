@@ -90,14 +90,19 @@ def _check_axes(name: str, tensor: torch.Tensor, axes: Sequence[Any]) -> None:
                          f"[{', '.join(map(str, axes))}]")
 
 
+def _refuse_lens(settings: Settings, what: str) -> None:
+    """Raises NotImplementedError unless each pixel is seen by one pose and by projmatrix."""
+    for name, only in (("camera_model", "pinhole"), ("rolling_shutter", "global")):
+        if getattr(settings, name) != only:
+            raise NotImplementedError(f"{name} is {getattr(settings, name)!r}; {what} are offered for {only!r} alone")
+
+
 def pixel_rays(settings: Settings, like: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
     """Returns x [W] and y [H] of the rays (x, y, 1) through the pixels, in the camera's frame.
 
-    Raises NotImplementedError for a lens, which does not project by projmatrix.
+    Raises NotImplementedError for a lens or a rolling shutter.
     """
-    if settings.camera_model != "pinhole":
-        raise NotImplementedError(f"camera_model is {settings.camera_model!r}; rays of pixels are offered for "
-                                  "'pinhole' alone")
+    _refuse_lens(settings, "rays of pixels")
     lens = torch.linalg.solve(settings.viewmatrix.to(like), settings.projmatrix.to(like))
     x, y = ((2 * torch.arange(size).to(like) + 1) / size - 1 for size in (settings.image_width, settings.image_height))
     return (x - lens[2, 0]) / lens[0, 0], (y - lens[2, 1]) / lens[1, 1]
@@ -262,7 +267,11 @@ def _moved(settings: Settings, theta: Optional[torch.Tensor], rho: Optional[torc
 
 
 def _median_depth(settings: Settings, inputs: Dict[str, Any], maps: GateMap) -> torch.Tensor:
-    """Returns z [1, H, W] of the Gaussians that make pixels half full, 0 if none does; differentiable."""
+    """Returns z [1, H, W] of the Gaussians that make pixels half full, 0 if none does; differentiable.
+
+    Raises NotImplementedError for a lens or a rolling shutter.
+    """
+    _refuse_lens(settings, "median depths")
     means, which = inputs["means3D"], maps.medians
     if not len(means):
         return means.new_zeros(1, *which.shape)

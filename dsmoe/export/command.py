@@ -17,7 +17,7 @@ from ..results.glb import BLEND, Blend, glb_bytes
 from ..results.modelfile import read_gaussians, recorded_of, save_model
 from ..results.pictures import evenly_spaced
 from ..results.rows import blend_name, viewer_warning
-from ..results.shown import FAINT_BELOW
+from ..results.shown import FAINT_BELOW, faint_comment
 from ..results.splat import splat_bytes
 from ..results.spz import check_spz, spz_bytes
 from ..system.files import check_output, is_folder, new_file, write_atomically
@@ -124,7 +124,7 @@ def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: 
     known = (*recorded, FAINT_BELOW)  # also of an older name
     others = [line for line in gaussians.comments if line.split(" ")[0] not in known]
     if trained.renderer.faint_below is not None:
-        others.append(f"{FAINT_BELOW} {trained.renderer.faint_below:g}")
+        others.append(faint_comment(trained.renderer.faint_below))
     with new_file(path, overwrite) as temporary:
         io.write_gaussians(temporary, dataclasses.replace(gaussians, comments=tuple(others), **recorded))
 

@@ -20,6 +20,11 @@ FAINT_BELOW = "faint_below"  # in comments
 LEAST_OPACITY = 1e-5  # and the greatest is as far from 1: of formats that hold no logits
 
 
+def faint_comment(faint_below: float) -> str:
+    """What a .ply records of it, to the last digit: a rounded one would be another rendering's."""
+    return f"{FAINT_BELOW} {float(faint_below)!r}"
+
+
 def raw_of(gaussians: Gaussians, device: str = "cpu") -> Dict[str, torch.Tensor]:
     """The raw parameters in a file, float32."""
     arrays = {"means3D": gaussians.means3D, "dc": gaussians.dc, "shs": gaussians.shs,

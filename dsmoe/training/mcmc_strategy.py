@@ -16,7 +16,7 @@ from .randomness import draw
 from .strategy import Step, Strategy, StrategyContext
 
 DEAD_OPACITY = 0.005  # fainter Gaussians are relocated
-START_OPACITY, START_SCALE = 0.5, 0.1  # of the first Gaussians; the scale is this part of 3DGS's
+START_OPACITY, START_SCALE = 0.5, 0.1  # of Gaussians at points; the scale is this part of 3DGS's
 OPACITY_WEIGHT = SCALE_WEIGHT = 0.01  # lambda_o and lambda_Sigma of the loss
 NOISE_RATE = 5e5  # lambda_noise
 NOISE_STEEPNESS = 100.0  # k: Gaussians are moved by the noise if they are faint
@@ -29,6 +29,8 @@ class MCMCStrategy(Strategy):
 
     def __init__(self, context: StrategyContext) -> None:
         super().__init__(context)
+        if context.config.init:  # a model's Gaussians are not first guesses
+            return
         with torch.no_grad():
             context.model.raw["opacities"].fill_(float(inverse_sigmoid(torch.tensor(START_OPACITY))))
             context.model.raw["scales"] += float(torch.tensor(START_SCALE).log())

@@ -254,7 +254,7 @@ class _Client:
         if moves and self.seconds_per_pixel > 0:
             affordable = MOVING_SECONDS / self.seconds_per_pixel
             share = min(1.0, math.sqrt(affordable / (camera.width * camera.height)))
-        camera = camera.resized(max(16, round(camera.width * share)), max(16, round(camera.height * share)))
+        camera = camera.resized(*(max(LEAST_SIDE, round(side * share)) for side in (camera.width, camera.height)))
         self.sharp = share == 1.0
         device = followed.renderer.background.device
         began = synchronised_time(str(device))

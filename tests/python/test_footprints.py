@@ -237,6 +237,8 @@ def test_a_gradient_by_depths_reaches_the_means():
 @pytest.mark.parametrize("options", [
     dict(blend_mode="alpha", antialiasing=True), dict(blend_mode="smoe", background_gate=0.5),
     dict(blend_mode="smoe", background_gate=torch.tensor(0.5, dtype=torch.float64)), dict(alpha_min=0.02),
+    dict(blend_mode="smoe_eq7", background_gate=0.5),
+    dict(blend_mode="smoe_eq7", background_gate=torch.tensor(0.5, dtype=torch.float64), alpha_min=0.001),
     dict(blend_mode="smoe_tn")])
 def test_a_gradient_by_the_reach_reaches_what_the_opacity_is_made_of(options):
     """In double, with steps of 1e-6, against finite differences of what the projection returns."""

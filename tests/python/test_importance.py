@@ -199,6 +199,17 @@ def test_other_outputs_and_absent_maps_change_nothing(mode):
         importance_of(scene, ones.float())
 
 
+@with_removal
+def test_a_background_that_changes_before_sums_are_asked_for_changes_nothing(mode):
+    scene = random_scene(mode, 50, 33, 21, scale=0.2)
+    stepped = {name: tensor.clone() for name, tensor in scene.camera().items() if name in ("bg", "background_gate")}
+    splats = rasterize_with_splats(settings=scene.settings._replace(**stepped), **scene.inputs)[1]
+    for tensor in stepped.values():
+        tensor += 0.5
+    for values, expected in zip(splats.importance(), importance_of(scene)):
+        assert_close(values, expected, 1e-12, "sums")
+
+
 @pytest.mark.parametrize("mode", REMOVABLE_MODES)
 def test_no_gaussians_have_no_importance(mode):
     scene = random_scene(mode, 20, 33, 21).rows(slice(0))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from comparison import assert_all_close, assert_close
+from devices import on_the_cpu
 from lens_scenes import (
     GRID,
     LENSES,
@@ -18,7 +19,7 @@ from lens_scenes import (
     projected,
     shape_error,
 )
-from scenes import gradients, op_arguments, random_scene, turned
+from scenes import Scene, gradients, op_arguments, random_scene, turned
 
 from diff_smoe_rasterization import (
     GaussianRasterizer,
@@ -77,20 +78,6 @@ def test_a_camera_that_stands_still_has_the_image_of_a_global_shutter(shutter):
     assert_all_close(found, wanted, 1e-12)
 
 
-@pytest.mark.parametrize("shutter, sign", [("left_to_right", 1), ("right_to_left", -1)])
-def test_what_flees_across_the_seam_of_a_panorama_is_never_read(shutter, sign):
-    """Its column is 63.2 of 64 at first and -0.2 at last, or the mirror image: no column is read while it is there."""
-    x = 2 * math.tan(0.3 * math.pi / 32) * sign
-    settings = settings_from_camera(None, torch.eye(3), torch.zeros(3), 64, 32, camera_model="equirectangular",
-                                    rolling_shutter=shutter, end=(torch.eye(3), torch.tensor([-2 * x, 0.0, 0.0])))
-    arguments = dict(means3D=torch.tensor([[x, 0, -2.0], [5 * x, 0, -2]]), opacities=torch.full((2, 1), 0.9),
-                     settings=settings, colors_precomp=torch.ones(2, 3), scales=torch.full((2, 3), 0.05),
-                     rotations=torch.tensor([[1.0, 0, 0, 0]] * 2))
-    radii = rasterize(**arguments).radii
-    assert (radii > 0).tolist() == [False, True]
-    assert torch.equal(reference.rasterize(**arguments).radii, radii)
-
-
 @pytest.mark.parametrize("model, distortion", [("opencv", (-0.25, 0.06, 0.001, -0.002)),
                                                ("fisheye", (0.02, -0.008, 0.002, -0.0003))])
 @pytest.mark.parametrize("shutter", ROLLING_SHUTTERS[1:])
@@ -140,6 +127,27 @@ def test_footprints_are_those_of_brute_force(model, distortion, shutter):
         still_errors.append(shape_error(projected(means[i:i + 1], axes[i:i + 1], still)[1][0], covariance))
     assert max(errors) < 0.01
     assert np.median(still_errors) > 0.05
+
+
+@pytest.mark.parametrize("shutter, seen", [("left_to_right", False), ("right_to_left", True)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_point_that_crosses_the_seam_against_the_shutter_is_never_seen(shutter, seen, dtype):
+    """The camera turns by 0.2, and a point goes at t = 0.25 from column 62.99 to the left border, to 1.03 at t = 1.
+
+    From left to right the last column is read at t = 1 and the first at t = 0; the point then is at the other side.
+    """
+    scene = rolling_scene("smoe", "equirectangular", shutter).to(dtype)
+    view = torch.eye(4).to(scene.settings.viewmatrix)
+    settings = scene.settings._replace(image_width=64, image_height=32, viewmatrix=view, campos=torch.zeros_like(
+        scene.settings.campos), viewmatrix_end=turned(view, (0, 0.2, 0), (0, 0, 0)))
+    longitude = math.pi - 0.05
+    inputs = {name: tensor[:1] for name, tensor in scene.inputs.items()}
+    inputs["means3D"] = 2 * view.new_tensor([[math.sin(longitude), 0, math.cos(longitude)]])
+    inputs["scales"] = torch.full_like(inputs["scales"], 0.05)
+    assert (rasterize(settings=settings, **inputs).radii > 0).tolist() == [seen]
+    with on_the_cpu():
+        on_cpu = Scene(inputs, settings).to("cpu")
+        assert (reference.rasterize(settings=on_cpu.settings, **on_cpu.inputs).radii > 0).tolist() == [seen]
 
 
 def test_both_halves_of_a_rendering():

@@ -139,17 +139,6 @@ template <class S> DSMOE_HD S opacity_compensation(const Conic<S>& conic) {
   return sqrt(max(S(kCompensationFloor), conic.unfiltered / conic.determinant));
 }
 
-template <class S>
-DSMOE_HD Sym2<S> opacity_compensation_backward(const Sym2<S>& cov2d, const Conic<S>& conic, S dL_dfactor) {
-  const S ratio = conic.unfiltered / conic.determinant;
-  if (!(ratio > S(kCompensationFloor))) return {S(0), S(0), S(0)};
-  const S dL_dratio = dL_dfactor * S(0.5) / sqrt(ratio);
-  const S dL_dbefore = dL_dratio / conic.determinant, dL_dafter = -dL_dratio * ratio / conic.determinant;
-  const auto& c = conic.filtered;
-  return {dL_dbefore * cov2d.yy + dL_dafter * c.yy, S(-2) * (dL_dbefore + dL_dafter) * cov2d.xy,
-          dL_dbefore * cov2d.xx + dL_dafter * c.xx};
-}
-
 // The loss's derivative by Sigma2D, H = -K G K + E, as the factors that it is made of. K is the conic, G the derivative
 // by it, and E comes from antialiasing. H itself is never formed: that of a long thin Gaussian is large, and its
 // rounding is no longer orthogonal to what H multiplies next. So K meets that first.

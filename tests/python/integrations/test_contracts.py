@@ -510,6 +510,13 @@ def test_results_in_any_order_and_the_depth_where_a_pixel_is_half_full(mode):
     counts = torch.bincount((expected.reshape(-1, 1) == z).int().argmax(1)[expected.reshape(-1) > 0], minlength=N)
     along = scene.settings.viewmatrix[:3, 2].detach()
     assert_close(scene.inputs["means3D"].grad, counts[:, None] * along, TOLERANCE * N, "means3D")
+    fisheye = scene.settings._replace(camera_model="fisheye")
+    rolls = scene.settings._replace(rolling_shutter="top_to_bottom", principal_point=(WIDTH / 2, HEIGHT / 2),
+                                    viewmatrix_end=scene.settings.viewmatrix)
+    for other, words in ((fisheye, "camera_model is 'fisheye'; median depths are offered for 'pinhole' alone"),
+                         (rolls, "rolling_shutter is 'top_to_bottom'; median depths are offered for 'global' alone")):
+        with pytest.raises(NotImplementedError, match=words):
+            rasterizer(raster_settings=other)(**scene.inputs)
     for wrong in (("color", "depth"), ("color", "radii", "color"), ("color", "radii", "normals")):
         with pytest.raises(KeyError):
             contract_of(",".join(wrong))

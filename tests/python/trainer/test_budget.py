@@ -469,7 +469,8 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
     assert moved == [([3], [7])], "8 costs 1, more than a fifth of the error at 4"
 
 
-def test_children_lie_on_the_longest_axis(tiny_config):
+@pytest.mark.parametrize("opacity, child", [(0.5, (1 - math.sqrt(0.5)) / 0.744), (0.99, 0.99)])
+def test_children_lie_on_the_longest_axis(tiny_config, opacity, child):
     trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     for _ in range(2):
         trainer.step()
@@ -477,14 +478,14 @@ def test_children_lie_on_the_longest_axis(tiny_config):
     with torch.no_grad():
         model.raw["scales"][5] = torch.tensor([0.1, 0.4, 0.2]).log()
         model.raw["rotations"][5] = torch.tensor([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])  # y becomes -x
-        model.raw["opacities"][5] = torch.logit(torch.tensor(0.5))
+        model.raw["opacities"][5] = torch.logit(torch.tensor(opacity))
         mean = model.raw["means3D"][5].clone()
         second = {name: adam.state[model.raw[name]]["exp_avg_sq"][5].clone() for name in ("means3D", "scales")}
         trainer.strategy.split(torch.tensor([5]), torch.tensor([9]))
         for row, side in ((5, 1), (9, -1)):
             torch.testing.assert_close(model.raw["means3D"][row] - mean, torch.tensor([-0.2 * side, 0, 0]))
             torch.testing.assert_close(model.scales[row], torch.tensor([0.1, 0.4 * 0.65, 0.2]))
-            assert float(model.opacities[row]) == pytest.approx((1 - math.sqrt(0.5)) / 0.744, abs=1e-6)
+            assert float(model.opacities[row]) == pytest.approx(child, abs=1e-6)
             for name, squares in second.items():
                 assert not adam.state[model.raw[name]]["exp_avg"][row].any()
                 assert torch.equal(adam.state[model.raw[name]]["exp_avg_sq"][row], squares)
@@ -501,13 +502,16 @@ def test_copies_look_as_the_one_before(opacity, copies):
     assert (1 - (1 - new * new_kernel)**copies).sum() == pytest.approx(float((opacity * old_kernel).sum()), rel=1e-9)
 
 
-def test_mcmc_regularises_opacities_and_scales(tiny_config):
+@pytest.mark.parametrize("views", [1, 3])
+def test_mcmc_regularises_opacities_and_scales(tiny_config, views):
+    """Once for each view of a step, whose gradients are sums over its views."""
     trainer = trainer_of(tiny_config, strategy="mcmc", budget=100)
     raw = trainer.model.raw
-    expected = (OPACITY_WEIGHT * raw["opacities"].sigmoid().mean() + SCALE_WEIGHT * raw["scales"].exp().mean())
+    of_a_view = OPACITY_WEIGHT * raw["opacities"].sigmoid().mean() + SCALE_WEIGHT * raw["scales"].exp().mean()
+    expected = views * of_a_view
     gradients = torch.autograd.grad(expected, [raw["opacities"], raw["scales"]])
     with torch.no_grad():
-        trainer.strategy.after_backward(SimpleNamespace(batch=1, add_gradient=partial(add_gradient, trainer.model)))
+        trainer.strategy.after_backward(SimpleNamespace(batch=views, add_gradient=partial(add_gradient, trainer.model)))
     torch.testing.assert_close(raw["opacities"].grad, gradients[0])
     torch.testing.assert_close(raw["scales"].grad, gradients[1])
 
@@ -522,6 +526,20 @@ def test_noise_shakes_the_faint_only(tiny_config):
         trainer.strategy.shake()
     moved = (trainer.model.raw["means3D"] - before).abs().max(1).values
     assert (moved[:50] > 0).all() and moved[50:].max() < 1e-12 * moved[:50].max()
+
+
+def test_noise_falls_with_the_rate_of_positions(tiny_config):
+    trainer, moved = trainer_of(tiny_config, strategy="mcmc", budget=100), []
+    for iteration in (1, 20):
+        trainer.optimizer.set_position_rate(iteration)
+        torch.manual_seed(0)
+        with torch.no_grad():
+            trainer.model.raw["opacities"].fill_(torch.logit(torch.tensor(0.001)))
+            trainer.model.raw["means3D"].zero_()
+            trainer.strategy.shake()
+        moved.append(trainer.model.raw["means3D"].detach() / trainer.optimizer.position_rate)
+    assert moved[0].all()
+    torch.testing.assert_close(*moved)
 
 
 @pytest.mark.parametrize("options, words", [

@@ -65,7 +65,8 @@ def test_every_format_is_rendered_exported_and_viewed(model, tiny_scene, tmp_pat
 
 @pytest.mark.parametrize("ending", ENDINGS[:3])
 @pytest.mark.parametrize("words, blend", [
-    (["--blend-mode", "smoe", "--background-gate", "0.25"], ("smoe", 0.25, None)), (["--paper"], ("smoe", 0, 2))])
+    (["--blend-mode", "smoe", "--background-gate", "0.25"], ("smoe", 0.25, None)), (["--paper"], ("smoe", 0, 2)),
+    (["--blend-mode", "smoe", "--background-gate", "0", "--faint-below", "0.123456789"], ("smoe", 0, 0.123456789))])
 def test_a_file_without_a_record_is_declared_by_the_options(model, tiny_scene, tmp_path, capsys, ending, words, blend):
     """A .glb always says how it is blended. None: as usual."""
     path, declared = exported(model, tmp_path, ending), str(tmp_path / "declared.ply")

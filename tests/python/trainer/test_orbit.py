@@ -165,6 +165,8 @@ def test_an_mp4_plays_every_frame(tmp_path):
     ("a.gif", ["--depth"], "a video has room for colours only"), ("a", ["--frames", "0"], "--frames is 0"),
     *(("a.gif", ["--fps", fps], f"--fps is {fps}; it must be from 0.01 to 1000")
       for fps in ("0", "1e-308", "0.009", "-1", "1001", "inf", "nan")),
+    ("a.gif", ["--frames", "100001"], "--frames is 100001; it must be from 1 to 100000"),
+    ("a.png", [], "a.png: -o names a folder for images"),
     ("a.mov", [], "a video can end in .mp4, .gif or .webp; .mov is not written")])
 def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, arguments, text):
     assert orbit(model, tmp_path / output, *arguments) == 1

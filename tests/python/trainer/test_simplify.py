@@ -607,10 +607,12 @@ def test_ctrl_c_keeps_the_model_and_resume_ends_where_it_would_have(run, tmp_pat
     assert results_of(broken)[0]["start"] == start and results_of(broken)[0]["protocol"]["iterations"] == 44
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_a_training_from_a_model_begins_with_its_image(run, degree):
+@pytest.mark.parametrize("degree, strategy", [
+    (0, "importance"), (1, "importance"), (3, "importance"), (1, "3dgs"), (1, "steady"), (1, "mcmc")])
+def test_a_training_from_a_model_begins_with_its_image(run, degree, strategy):
     """With fewer harmonics it is what they show, with more the others begin with 0."""
-    config = run.changed(init=ply_of(run), sh_degree=degree)
+    budget = results_of(run.output)[0]["num_gaussians"]
+    config = run.changed(init=ply_of(run), sh_degree=degree, strategy=strategy, budget=budget)
     scene = load_scene(config, progress=False)
     trainer = Trainer(config, scene)
     assert trainer.model.active_sh_degree == min(degree, 1)

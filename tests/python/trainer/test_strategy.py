@@ -85,6 +85,21 @@ def test_small_ones_are_cloned_and_large_ones_split():
     assert len({tuple(row.tolist()) for row in model.raw["means3D"][4:]}) == 4, "children have places of their own"
 
 
+def test_growth_takes_nothing_that_no_view_has_a_gradient_of():
+    """However many are asked for."""
+    context = context_of([SMALL] * 4, [0.5] * 4)
+    before = context.model.raw["dc"].detach().clone()
+    STRATEGIES["steady"](context).densify(torch.tensor([0.0, 1e-6, 0.0, 1e-5]), least=3)
+    assert torch.equal(context.model.raw["dc"][4:], before[[1, 3]])
+
+
+def test_learning_rates_are_those_of_3dgs():
+    rates = {group["name"]: group["lr"] for group in context_of([SMALL], [0.5]).optimizer.adam.param_groups}
+    published = {"means3D": 0.00016 * EXTENT, "dc": 0.0025, "shs": 0.000125, "opacities": 0.05, "scales": 0.005,
+                 "rotations": 0.001}
+    assert rates == pytest.approx(published)
+
+
 def test_adam_forgets_the_new_and_remembers_the_old():
     context = context_of([SMALL, SMALL, LARGE, LARGE], [0.5] * 4)
     steps = [float(context.optimizer.adam.state[context.model.raw[name]]["step"]) for name in PARAMETERS]
