@@ -23,7 +23,7 @@ constexpr float kFaintEverywhere = 2.0f;  // no gate sum of a mode that has fain
 // has no gradient, and would never come back. For the same reason such a pair is faint only below kCoreAlpha: a cut at
 // 1/255 there loses 0.2 dB of models with many faint Gaussians.
 constexpr float kCoreKernel = 0.011108996538242306f;
-constexpr float kCoreAlpha = 1.0f / 1020.0f;
+constexpr float kCoreAlpha = kAlphaCut / 4;
 constexpr double kLog2AlphaCut = -7.994353351539342, kLog2CoreAlpha = kLog2AlphaCut - 2;  // of the two floats
 constexpr double kLog2CoreKernel = -6.492127708889321;                                    // of the float
 constexpr float kTransmittanceCut = 1e-4f;     // a pixel is full if the next pair would leave less

@@ -14,17 +14,17 @@ DSMOE_HD constexpr int sh_coefficients(int degree) { return (degree + 1) * (degr
 constexpr double kSh0 = 0.28209479177387814;
 constexpr double kSh1 = 0.4886025119029199;
 constexpr double kSh2_0 = 1.0925484305920792;
-constexpr double kSh2_1 = -1.0925484305920792;
+constexpr double kSh2_1 = -kSh2_0;
 constexpr double kSh2_2 = 0.31539156525252005;
-constexpr double kSh2_3 = -1.0925484305920792;
+constexpr double kSh2_3 = -kSh2_0;
 constexpr double kSh2_4 = 0.5462742152960396;
 constexpr double kSh3_0 = -0.5900435899266435;
 constexpr double kSh3_1 = 2.890611442640554;
 constexpr double kSh3_2 = -0.4570457994644658;
 constexpr double kSh3_3 = 0.3731763325901154;
-constexpr double kSh3_4 = -0.4570457994644658;
+constexpr double kSh3_4 = kSh3_2;
 constexpr double kSh3_5 = 1.445305721320277;
-constexpr double kSh3_6 = -0.5900435899266435;
+constexpr double kSh3_6 = kSh3_0;
 
 // One number per coefficient. Those above the degree in use mean nothing.
 template <class S> struct ShNumbers {

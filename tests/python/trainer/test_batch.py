@@ -9,6 +9,7 @@ import torch
 
 from dsmoe.distributed.trainer import BatchTrainer
 from dsmoe.errors import ConfigError, TrainerError
+from dsmoe.options.config import LEARNED, GateOptions
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
@@ -82,6 +83,16 @@ def test_rates_and_betas_follow_the_square_root_rule(tiny_config, scene):
     for group, batched in zip(one.optimizer.adam.param_groups, four.optimizer.adam.param_groups):
         assert batched["lr"] == pytest.approx(2 * group["lr"], rel=1e-12)
         assert batched["betas"] == pytest.approx((0.9**4, 0.999**4), rel=1e-12) != group["betas"]
+
+
+@pytest.mark.parametrize("batch", [1, 4])
+def test_the_rate_of_the_gate_follows_the_same_rule(batch):
+    """Adam's first step is the rate, against the gradient's sign."""
+    gate = LearnedGate(GateOptions(LEARNED, 0.0, 0.1, 0.03), batch, "cpu")
+    gate.gradient.fill_(0.7)
+    before = float(gate.logarithm)
+    gate.step()
+    assert float(gate.logarithm) - before == pytest.approx(-0.03 * batch**0.5, rel=1e-5)
 
 
 def test_milestones_count_views(tiny_config, scene):

@@ -22,7 +22,7 @@ from dsmoe.train import train
 from dsmoe.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
 from dsmoe.training.passes import add_gradient
 from dsmoe.training.room import gaussian_bytes
-from dsmoe.training.strategy import Look
+from dsmoe.training.strategy import Look, Step
 from dsmoe.training.trainer import Trainer
 
 
@@ -452,6 +452,17 @@ def test_an_average_follows_the_gaussians(tiny_config):
         else:
             assert torch.equal(average[new[:2]], raw[name][new[:2]])
             assert torch.equal(average[new[2:]], before[name][[3, 4]]), "a copy has its parent's"
+
+
+def test_a_batch_over_a_removal_and_a_move_only_removes(tiny_config, monkeypatch):
+    trainer, done = trainer_of(tiny_config, strategy="importance", budget=60), []
+    strategy = trainer.strategy
+    assert strategy.removals and strategy.moves
+    monkeypatch.setattr(strategy, "remove", lambda steps_left: done.append("removal"))
+    monkeypatch.setattr(strategy, "move", lambda: done.append("move"))
+    for first, last in ((1, strategy.moves[0]), (strategy.removals[-1] + 1, strategy.moves[0])):
+        strategy.after_step(Step(last, last - first + 1, torch.zeros(())))
+    assert done == ["removal", "move"]
 
 
 def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
