@@ -4,6 +4,6 @@ from __future__ import annotations
 import torch
 
 
-def as_float(image: torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-    """An image of bytes in [0, 1], of this type; floats as they are."""
-    return image if image.is_floating_point() else image.to(dtype) / 255
+def as_float(image: torch.Tensor) -> torch.Tensor:
+    """An image of bytes as float32 in [0, 1]; floats as they are."""
+    return image if image.is_floating_point() else image.float() / 255

@@ -26,7 +26,7 @@ from .results.modelfile import (
     model_path,
 )
 from .results.pictures import file_names
-from .results.rendering import Rasterize, Renderer, background_color
+from .results.rendering import Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
@@ -44,8 +44,7 @@ RENDER = "dsmoe render"  # in its folders' records
 
 
 def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_folder: Optional[str] = None,
-                 progress: bool = True, rasterize: Optional[Rasterize] = None,
-                 measure: Measure = image_metrics) -> Dict[str, Any]:
+                 progress: bool = True, measure: Measure = image_metrics) -> Dict[str, Any]:
     """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
 
     Of a training that has not ended, its checkpoint is measured, and nothing is written.
@@ -57,7 +56,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     options = {"scene": scene_folder} if scene_folder else {}
     config = TrainConfig.of_run(output, "--scene", device=device, **options)
     check_device(device)
-    opened = open_run(config, None, None, device, rasterize)
+    opened = open_run(config, None, None, device)
     earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     layout = read_layout(config)
     scene = load_scene(config, progress, layout).to(device)
@@ -95,8 +94,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
 
 
 def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str], device: str,
-                  rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None,
-                  asked_faint: Optional[float] = None) -> Renderer:
+                  asked_gate: Optional[float] = None, asked_faint: Optional[float] = None) -> Renderer:
     """A renderer for a file of a model with the blend that it records.
 
     config gives background and antialiasing. Raises TrainerError if what is asked disagrees with the file.
@@ -105,7 +103,7 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
     gate = agreed_background_gate(ply, mode, recorded, asked_gate)
     faint = agreed_faint_below(ply, mode, recorded, asked_faint)
-    return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
+    return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing,
                     background_gate=gate, faint_below=faint)
 
 
@@ -118,7 +116,7 @@ class OpenedRun(NamedTuple):
 
 
 def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
-             rasterize: Optional[Rasterize] = None, asked_faint: Optional[float] = None) -> OpenedRun:
+             asked_faint: Optional[float] = None) -> OpenedRun:
     """A renderer for the model of the run that config is of; before its end, of its checkpoint, which a line says.
 
     Raises TrainerError if there is neither, and if what is asked disagrees with the run.
@@ -126,26 +124,25 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     ply = model_path(config.output, config.iterations)
     if is_file(ply):
         mode, gate, _ = _agreed_with_run(config, asked_blend_mode, asked_gate, asked_faint)
-        return OpenedRun(open_renderer(config, ply, mode, device, rasterize, gate), ply, None)
+        return OpenedRun(open_renderer(config, ply, mode, device, gate), ply, None)
     if not is_file(os.path.join(config.output, CHECKPOINT_NAME)):
         _agreed_with_run(config, asked_blend_mode, asked_gate, asked_faint)
         raise TrainerError(f"{ply}: no such file; the training in {config.output} has not ended, and has no checkpoint "
                            "yet (continue it with --resume)")
-    renderer, so_far = open_checkpoint(config, asked_blend_mode, asked_gate, device, rasterize, asked_faint)
+    renderer, so_far = open_checkpoint(config, asked_blend_mode, asked_gate, device, asked_faint)
     print(f"note: the training in {printable(config.output)} has not ended; this is its checkpoint, at iteration "
           f"{so_far.iteration:,} of {config.iterations:,}", file=sys.stderr)
     return OpenedRun(renderer, so_far.path, so_far)
 
 
 def open_checkpoint(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
-                    rasterize: Optional[Rasterize] = None, asked_faint: Optional[float] = None
-                    ) -> Tuple[Renderer, SoFar]:
+                    asked_faint: Optional[float] = None) -> Tuple[Renderer, SoFar]:
     """A renderer for the checkpoint of the run that config is of, and what that holds. Raises as `open_run`."""
     mode, gate, faint = _agreed_with_run(config, asked_blend_mode, asked_gate, asked_faint)
     so_far = made_so_far(config, device)
     gate = agreed_background_gate(so_far.path, mode, Recorded(mode, so_far.background_gate), gate)
     return Renderer(so_far.model, mode, background_color(config.white_background, device), config.antialiasing,
-                    rasterize, background_gate=gate, faint_below=faint), so_far
+                    background_gate=gate, faint_below=faint), so_far
 
 
 def _agreed_with_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float],
@@ -181,8 +178,7 @@ def compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
 
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: Optional[str] = None,
                   blend_mode: Optional[str] = None, device: str = "cpu",
-                  rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
-                  outputs: Sequence[str] = (), overwrite: bool = False,
+                  background_gate: Optional[float] = None, outputs: Sequence[str] = (), overwrite: bool = False,
                   faint_below: Optional[float] = None) -> List[str]:
     """Writes a PNG per camera of config.scene into `folder`; returns the paths.
 
@@ -199,9 +195,9 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: O
     check_ending(folder, orbit=False)
     own_record(folder, RENDER, overwrite)  # refused before anything is read
     if ply is None:
-        renderer, ply, _ = open_run(config, blend_mode, background_gate, device, rasterize, faint_below)
+        renderer, ply, _ = open_run(config, blend_mode, background_gate, device, faint_below)
     else:
-        renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate, faint_below)
+        renderer = open_renderer(config, ply, blend_mode, device, background_gate, faint_below)
     cameras = load_cameras(config, split or "test")
     if not cameras and not split:
         cameras = load_cameras(config, "train")
@@ -286,10 +282,10 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
     so_far, missing = None, ""
     if holds_run(source):
         config = TrainConfig.load(source).changed(**options)
-        renderer, path, so_far = open_run(config, blend_mode, background_gate, device, None, faint_below)
+        renderer, path, so_far = open_run(config, blend_mode, background_gate, device, faint_below)
     else:
         config, path, missing = config_of_model(source, **options)
-        renderer = open_renderer(config, path, blend_mode, device, None, background_gate, faint_below)
+        renderer = open_renderer(config, path, blend_mode, device, background_gate, faint_below)
     if config.scene:
         missing = "" if is_folder(config.scene) or "scene" in options else config.scene
     if missing:

@@ -67,11 +67,10 @@ class Camera:
         return dataclasses.replace(self, lens=None, fx=factor * self.fx, fy=factor * self.fy)
 
     def settings(self, background: torch.Tensor, sh_degree: int, blend_mode: str,
-                 antialiasing: bool = False, scale_modifier: float = 1.0,
-                 dtype: Optional[torch.dtype] = None) -> GaussianRasterizationSettings:
-        """Rasterization settings of this camera, on the background's device.
+                 antialiasing: bool = False) -> GaussianRasterizationSettings:
+        """Rasterization settings of this camera, with matrices of the background's type and on its device.
 
-        background: [3]. dtype: of the matrices, by default the background's.
+        background: [3].
         """
         K: Any = [[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]]
         lens: Dict[str, Any] = {}
@@ -79,7 +78,7 @@ class Camera:
             lens = {"camera_model": self.lens.camera_model, "distortion": self.lens.coefficients}
             K = None if lens["camera_model"] == "equirectangular" else K
         return settings_from_camera(K, self.rotation, self.translation, self.width, self.height, background, sh_degree,
-                                    scale_modifier, dtype, antialiasing=antialiasing, blend_mode=blend_mode, **lens)
+                                    antialiasing=antialiasing, blend_mode=blend_mode, **lens)
 
 
 def quaternion_to_rotation(quaternion: Sequence[float]) -> np.ndarray:

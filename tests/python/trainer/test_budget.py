@@ -452,6 +452,8 @@ def test_an_average_follows_the_gaussians(tiny_config):
         else:
             assert torch.equal(average[new[:2]], raw[name][new[:2]])
             assert torch.equal(average[new[2:]], before[name][[3, 4]]), "a copy has its parent's"
+    optimizer.replace_all({name: tensor.detach() for name, tensor in raw.items()})
+    assert not optimizer.average, "what replaces all leaves none"
 
 
 def test_a_batch_over_a_removal_and_a_move_only_removes(tiny_config, monkeypatch):
