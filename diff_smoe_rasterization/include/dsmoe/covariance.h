@@ -225,14 +225,10 @@ DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3
     // The columns k, j have the minor -minor[l], and l, j have minor[k].
     return product(variance[l], product(minor[k], across(l))) - product(variance[k], product(minor[l], across(k)));
   };
-  const S scales[] = {scale.x, scale.y, scale.z};
   const auto entry = [&](int i, int j) {
-    S by_cov = bilinear(h.direct, m.of[i], t.of[j]);
+    S by_cov = bilinear(h.direct, m.of[i], t.of[j]) - bilinear(h.by_conic, km.of[i], kt.of[j]);
     if (h.by_adjugate != S(0)) by_cov += product(h.by_adjugate, adjugate(i, j));
-    // K M K t overflows for a Gaussian far thinner than a pixel; s K M and s K t do not.
-    const auto scaled = [&](Vec2<S> v) { return Vec2<S>{scales[j] * v.x, scales[j] * v.y}; };
-    const S by_conic = bilinear(h.by_conic, scaled(km.of[i]), scaled(kt.of[j]));
-    return S(2) * (product(variance[j], by_cov) - by_conic);
+    return product(S(2) * variance[j], by_cov);
   };
   return {factor.turned.r0 * dL_da + factor.turned.r1 * dL_db,
           {{entry(0, 0), entry(0, 1), entry(0, 2)},
