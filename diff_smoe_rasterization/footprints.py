@@ -77,7 +77,8 @@ class Footprints(NamedTuple):
     def around(self, width: int) -> Footprints:
         """Those of an equirectangular image of this width, and the footprints that cross its seam on both sides of it.
 
-        Copies, moved by the width, follow the others: those of `copied`. The host waits for their number. Raises
+        Copies, moved by the width, follow the others: those of `copied`. A footprint has at most one copy on each side,
+        so the seam shows where a footprint reaches further than the width. The host waits for their number. Raises
         ValueError for a width below 1.
         """
         parts = [self]
@@ -91,9 +92,8 @@ class Footprints(NamedTuple):
         """Which footprints `around` copies, int64: to the right those at the left border, then those at the right."""
         if width < 1:
             raise ValueError(f"around: width is {width}; it must be that of the equirectangular image, 1 or more")
-        column, faintest = self.gates[:, 0], _core.constants["every_tail_alpha"]
-        squared = (2 * (self.opacities / faintest).log()).maximum(self.gates[:, _REACH])  # in sigmas, in any mode
-        reach = self.radii * squared.clamp(min=9).sqrt() / 3
+        column, opacity, squared_reach = self.gates.detach()[:, (0, _OPACITY, _REACH)].unbind(1)
+        reach = _OPS.pixel_reach(self.radii, opacity, squared_reach)
         return (((self.radii > 0) & (column < reach)).nonzero().squeeze(1),
                 ((self.radii > 0) & (column > width - 1 - reach)).nonzero().squeeze(1))
 

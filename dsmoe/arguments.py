@@ -12,7 +12,7 @@ from .bench.names import SCENES, SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
 from .options import choices
 from .options.config import PRINCIPAL_POINTS, TrainConfig
-from .options.config_arguments import add_arguments, number, whole_number
+from .options.config_arguments import add_arguments, file_name, number, whole_number
 from .options.presets import BEST, FAST
 from .patches import TRAINERS
 
@@ -41,10 +41,11 @@ def build_parser() -> argparse.ArgumentParser:
                                       "       %(prog)s --resume -o OUT [OPTION ...]",
                                 description="Trains Gaussians on a scene: photographs whose cameras are known.",
                                 formatter_class=argparse.RawDescriptionHelpFormatter, epilog=TRAIN_EXAMPLES)
-    train.add_argument("scene", metavar="SCENE", nargs="?", default=argparse.SUPPRESS,
+    train.add_argument("scene", type=file_name, metavar="SCENE", nargs="?", default=argparse.SUPPRESS,
                        help="folder of a COLMAP scene, of a transforms.json (nerfstudio, instant-ngp, Polycam) or of a "
                             "NeRF-synthetic scene; --resume finds it in OUT")
-    train.add_argument("-o", "--output", metavar="OUT", default=argparse.SUPPRESS, help="folder to write")
+    train.add_argument("-o", "--output", type=file_name, metavar="OUT", default=argparse.SUPPRESS,
+                       help="folder to write")
     groups = add_arguments(train, skip=("scene", "output"))
     _add_paper(groups["blending"])
     groups["length, and number of Gaussians"].add_argument(
@@ -83,8 +84,9 @@ def build_parser() -> argparse.ArgumentParser:
                                 description="Finds where photographs were taken, by COLMAP, and writes a scene for "
                                             "`dsmoe train`: images, cameras and points. It "
                                             "needs pycolmap. Started again it goes on with what it has found.")
-    scene.add_argument("photos", metavar="PHOTOS", help="folder of photographs; subfolders are read too")
-    scene.add_argument("-o", "--output", metavar="SCENE", required=True,
+    scene.add_argument("photos", type=file_name, metavar="PHOTOS",
+                       help="folder of photographs; subfolders are read too")
+    scene.add_argument("-o", "--output", type=file_name, metavar="SCENE", required=True,
                        help="folder to write: new, empty, or of the same photographs")
     scene.add_argument("--matching", choices=choices.MATCHING, default=choices.MATCHING[0],
                        help="which photographs are compared. exhaustive: all pairs; sequential: neighbours by name, as "
@@ -102,9 +104,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     evaluate = commands.add_parser("eval", help="measure a trained run again",
                                    description="Measures PSNR, SSIM and FPS of a finished run.")
-    evaluate.add_argument("output", metavar="OUT", help="output folder of `dsmoe train`")
+    evaluate.add_argument("output", type=file_name, metavar="OUT", help="output folder of `dsmoe train`")
     evaluate.add_argument("--split", choices=("test", "train"), default="test", help="which views (default: test)")
-    evaluate.add_argument("--scene", help="where the scene lies now, if it has moved")
+    evaluate.add_argument("--scene", type=file_name, help="where the scene lies now, if it has moved")
     evaluate.add_argument("--lpips", choices=tuple(LPIPS_VARIABLES),
                           help="also LPIPS with this network; weights: $DSMOE_LPIPS_VGG or $DSMOE_LPIPS_ALEX, else "
                                "torchmetrics downloads them")
@@ -112,14 +114,14 @@ def build_parser() -> argparse.ArgumentParser:
 
     render = commands.add_parser("render", help="write images or a video of a trained model",
                                  description="Writes one PNG for every camera of a scene, or a video around it.")
-    render.add_argument("model", metavar="MODEL", help=choices.MODEL)
-    render.add_argument("-o", "--output", metavar="DIR|VIDEO", required=True,
+    render.add_argument("model", type=file_name, metavar="MODEL", help=choices.MODEL)
+    render.add_argument("-o", "--output", type=file_name, metavar="DIR|VIDEO", required=True,
                         help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
                              "that ends in .mp4 (needs imageio-ffmpeg), .gif or .webp")
     render.add_argument("--orbit", action="store_true", help="once around what the scene's cameras look at")
-    render.add_argument("--frames", type=whole_number, default=choices.ORBIT_FRAMES, metavar="N",
-                        help="of an orbit (default: %(default)s)")
-    render.add_argument("--fps", type=number, default=choices.VIDEO_FPS, metavar="X",
+    render.add_argument("--frames", type=whole_number, default=argparse.SUPPRESS, metavar="N",
+                        help=f"of an orbit (default: {choices.ORBIT_FRAMES})")
+    render.add_argument("--fps", type=number, default=argparse.SUPPRESS, metavar="X",
                         help=f"of a video (default: {choices.VIDEO_FPS:g})")
     render.add_argument("--split", choices=("test", "train", "all"),
                         help="which cameras (default: test, or train if there are none)")
@@ -140,8 +142,9 @@ def build_parser() -> argparse.ArgumentParser:
                                  description="Writes a trained model as one file. A page (.html) shows it in a "
                                              "browser by the blend that it was trained with; other viewers show the "
                                              "other formats by alpha.")
-    export.add_argument("model", metavar="MODEL", help=choices.MODEL)
-    export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
+    export.add_argument("model", type=file_name, metavar="MODEL", help=choices.MODEL)
+    export.add_argument("-o", "--output", type=file_name, metavar="FILE",
+                        help="file to write (default: model.FORMAT)")
     export.add_argument("--format", choices=choices.EXPORT_FORMATS,
                         help=f"default: by the ending of FILE, else {choices.EXPORT_FORMATS[0]}; spz needs gsply")
     export.add_argument("--sh-degree", type=whole_number, choices=range(4), metavar="N",
@@ -150,8 +153,8 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--bake", choices=("alpha",),
                         help="first fine-tune the model to this blend, which every viewer shows; needs the scene's "
                              "images, and prints the dB that it costs")
-    export.add_argument("--bake-iterations", type=whole_number, default=choices.BAKE_ITERATIONS, metavar="N",
-                        help="(default: %(default)s)")
+    export.add_argument("--bake-iterations", type=whole_number, default=argparse.SUPPRESS, metavar="N",
+                        help=f"(default: {choices.BAKE_ITERATIONS})")
     _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
     export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
     _add_device(export)
@@ -159,7 +162,7 @@ def build_parser() -> argparse.ArgumentParser:
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
                                description="Serves a live viewer of a run's model, of the checkpoints of a training "
                                            "that goes on, or of a file. It needs viser.")
-    view.add_argument("model", metavar="MODEL", help=choices.MODEL)
+    view.add_argument("model", type=file_name, metavar="MODEL", help=choices.MODEL)
     _add_model_options(view, "at whose first test view it begins (default: the run's)")
     view.add_argument("--host", default=choices.VIEW_HOST,
                       help="address to serve at; 0.0.0.0: to the network too (default: %(default)s, this machine only)")
@@ -207,10 +210,12 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_simplify_arguments(simplify: argparse.ArgumentParser) -> None:
-    simplify.add_argument("model", metavar="MODEL", help=choices.MODEL)
-    simplify.add_argument("-o", "--output", metavar="OUT", required=True, help="folder to write, as of `dsmoe train`")
-    simplify.add_argument("--scene", help="folder of the photographs (default: as the model's folder says; if it is "
-                                          "not there, the images are the model's renderings at its cameras.json)")
+    simplify.add_argument("model", type=file_name, metavar="MODEL", help=choices.MODEL)
+    simplify.add_argument("-o", "--output", type=file_name, metavar="OUT", required=True,
+                          help="folder to write, as of `dsmoe train`")
+    simplify.add_argument("--scene", type=file_name,
+                          help="folder of the photographs (default: as the model's folder says; if it is not there, "
+                               "the images are the model's renderings at its cameras.json)")
     stay = simplify.add_argument_group("number of Gaussians (one of these)").add_mutually_exclusive_group(
         required=True)
     stay.add_argument("--budget", type=whole_number, metavar="N", help="so many stay")
@@ -243,7 +248,7 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
-    parser.add_argument("--scene", help="folder " + scene)
+    parser.add_argument("--scene", type=file_name, help="folder " + scene)
     parser.add_argument("--blend-mode", choices=BLEND_MODES,
                         help="of a file that does not record it (default: alpha); must agree where it does")
     parser.add_argument("--background-gate", type=number, metavar="X",
@@ -261,7 +266,7 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
                        ("diff", "show what the patch changes, and write nothing"),
                        ("revert", "take the patch out of every file, byte for byte")):
         action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        action.add_argument("path", metavar="PATH", help="the checkout's folder")
+        action.add_argument("path", type=file_name, metavar="PATH", help="the checkout's folder")
         if name != "revert":
             action.add_argument("--modernise", action="store_true",
                                 help="also what the trainer needs to start on today's torch, CUDA and Python")
@@ -277,13 +282,15 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                              description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
                                          "becomes a row with its reason, and the command returns 1.",
                              usage="%(prog)s SUITE [-o RESULTS] [OPTION ...]")  # --slurm would take a SUITE behind it
-    run.add_argument("suite", metavar="SUITE", help=f"a .yaml file, or a shipped one: {', '.join(sorted(SHIPPED))}")
-    run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
+    run.add_argument("suite", type=file_name, metavar="SUITE",
+                     help=f"a .yaml file, or a shipped one: {', '.join(sorted(SHIPPED))}")
+    run.add_argument("-o", "--output", type=file_name, metavar="RESULTS",
+                     help="folder to write (default: bench_results/NAME)")
     run.add_argument("--device", choices=choices.DEVICES,
                      help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
     run.add_argument("--iterations", type=whole_number, metavar="N",
                      help="a trial: so many iterations, with the schedule squeezed into them; not for checkouts")
-    run.add_argument("--scenes", metavar="SCENES",
+    run.add_argument("--scenes", type=file_name, metavar="SCENES",
                      help=f"in place of the suite's: a .yaml file, or a shipped one: {', '.join(sorted(SCENES))}")
     run.add_argument("--jobs", type=whole_number, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
@@ -295,14 +302,16 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                           "mem_mb=32000 cpus_per_task=8")
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
                      help=f"only such cells; fields: {', '.join(SELECTORS)}")
-    run.add_argument("--rows", metavar="FILE|RESULTS",
+    run.add_argument("--rows", type=file_name, metavar="FILE|RESULTS",
                      help="a file of rows (.jsonl), or a folder of results, whose cells are not run again")
     run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
     run.add_argument("--dry-run", action="store_true", help="say which cells are done and which are not")
     report = actions.add_parser("report", help="tables, curves and a page of results",
                                 description="Writes tables, curves and a page that works offline.")
-    report.add_argument("results", metavar="RESULTS", help="folder of `dsmoe bench run`, or a file rows.jsonl")
-    report.add_argument("-o", "--output", metavar="DIR", default="report", help="folder to write (default: report)")
+    report.add_argument("results", type=file_name, metavar="RESULTS",
+                        help="folder of `dsmoe bench run`, or a file rows.jsonl")
+    report.add_argument("-o", "--output", type=file_name, metavar="DIR", default="report",
+                        help="folder to write (default: report)")
 
 
 def completion_script(shell: str) -> str:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import os
 import shlex
@@ -16,7 +17,7 @@ from .options.early import check_early
 from .options.presets import STRATEGY
 from .patches import PatchError
 from .system.interrupt import PromptInterrupt, exit_status
-from .system.process import command
+from .system.process import command, typed
 
 if TYPE_CHECKING:
     from .results.evaluation import Measure
@@ -48,7 +49,8 @@ def main(argv: Optional[List[str]] = None) -> int:
     try:
         take_paper(arguments)
         check_early(arguments)
-        status = COMMANDS[arguments.command](arguments) or 0
+        with PromptInterrupt() if arguments.command in ("render", "export") else contextlib.nullcontext():
+            status = COMMANDS[arguments.command](arguments) or 0
         sys.stdout.flush()
         return status
     except BrokenPipeError:  # whoever read the output, such as `head`, has enough of it
@@ -75,7 +77,7 @@ def _resume_command(arguments: argparse.Namespace) -> str:
     if arguments.command == "simplify":
         given = [word for word in arguments.command_words if word not in ("--resume", "--overwrite")]
         return " ".join([command(), *map(shlex.quote, given), "--resume"])
-    words = [command(), "train", "--resume", "-o", shlex.quote(arguments.output)]
+    words = [command(), "train", "--resume", "-o", typed(arguments.output)]
     size = os.environ.get("WORLD_SIZE", "1")
     if size == "1":
         return " ".join(words)
@@ -87,9 +89,9 @@ def _resume_command(arguments: argparse.Namespace) -> str:
 def _refuse(unknown: List[str], parser: argparse.ArgumentParser) -> None:
     """Ends the command with its usage, the words that it does not know, and the options that may be meant."""
     options = [option for action in parser._actions for option in action.option_strings]
-    typed = [word.partition("=")[0].replace("_", "-") for word in unknown if word.startswith("-")]
-    known = [name for name in map(OF_OTHERS.get, typed) if name in (*options, "SCENE")]
-    meant = known or [name for word in typed if word.startswith("--")
+    named = [word.partition("=")[0].replace("_", "-") for word in unknown if word.startswith("-")]
+    known = [name for name in map(OF_OTHERS.get, named) if name in (*options, "SCENE")]
+    meant = known or [name for word in named if word.startswith("--")
                       for name in difflib.get_close_matches(word, options, n=1, cutoff=0.7)]
     parser.error("unrecognized arguments: " + " ".join(unknown)
                  + (f" (is {', '.join(meant)} meant?)" if meant else ""))
@@ -124,7 +126,7 @@ def _bench_run(arguments: argparse.Namespace) -> int:
         print(f"{failed} of {len(rows)} cells failed; their rows say why, --retry-failed runs them again")
     if rows:
         results = arguments.output or os.path.join("bench_results", rows[0]["suite"])
-        print(f"rows: {printable(results)}; tables and curves of them: {command()} bench report {shlex.quote(results)}")
+        print(f"rows: {printable(results)}; tables and curves of them: {command()} bench report {typed(results)}")
     return 1 if failed else 0
 
 
@@ -228,7 +230,7 @@ def _train_in(group: Group, config: TrainConfig, layout: Optional[Layout], argum
     if viewer_warning(row):
         print(viewer_warning(row))
     print(f"model: {printable(model_path(config.output, config.iterations))}")
-    print(f"to look at it in a browser: {command()} export {shlex.quote(config.output)} -o model.html")
+    print(f"to look at it in a browser: {command()} export {typed(config.output)} -o model.html")
 
 
 def _simplify(arguments: argparse.Namespace) -> None:
@@ -259,7 +261,7 @@ def _simplify(arguments: argparse.Namespace) -> None:
     # Viewers blend by alpha; to bake a model to that needs photographs.
     bakes = row["blend_mode"] != "alpha" and row["protocol"]["scene_kind"] != "model"
     web = "model.spz" if bakes or row["blend_mode"] == "alpha" else "model.html"
-    print(f"for the web: {command()} export {shlex.quote(arguments.output)}{' --bake alpha' * bakes} -o {web}")
+    print(f"for the web: {command()} export {typed(arguments.output)}{' --bake alpha' * bakes} -o {web}")
 
 
 def _train_config(arguments: argparse.Namespace) -> Tuple[TrainConfig, Optional[Layout]]:
@@ -375,7 +377,8 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
 
     trained = open_trained(arguments.model, arguments.blend_mode, arguments.background_gate, arguments.device,
                            arguments.faint_below, **overrides)
-    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
+    given = {name: value for name, value in vars(arguments).items() if name in ("frames", "fps")}
+    print(film(trained, arguments.output, outputs=outputs, overwrite=arguments.overwrite, **given))
 
 
 def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
@@ -389,12 +392,11 @@ def _export(arguments: argparse.Namespace) -> None:
 
     if arguments.bake:
         _choose_device(arguments)
-    with PromptInterrupt():
-        path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
-                               arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
-                               bake=arguments.bake, bake_iterations=arguments.bake_iterations,
-                               device=arguments.device if arguments.bake else "cpu", faint_below=arguments.faint_below,
-                               **_overrides(arguments))
+    given = {name: value for name, value in vars(arguments).items() if name == "bake_iterations"}
+    path, warning = export(arguments.model, arguments.output, arguments.format, arguments.sh_degree,
+                           arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
+                           bake=arguments.bake, device=arguments.device if arguments.bake else "cpu",
+                           faint_below=arguments.faint_below, **given, **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

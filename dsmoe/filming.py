@@ -9,8 +9,8 @@ from PIL import Image
 from .errors import TrainerError
 from .inspection import Trained, said_of_images, to_image, write_images
 from .options.choices import ORBIT_FRAMES, VIDEO_FPS
-from .options.early import check_orbit
-from .results.video import check_ending, check_video, is_video, write_video
+from .options.early import check_ending, check_orbit, is_video
+from .results.video import check_video, write_video
 from .scenes.cameras import Camera
 from .system.progress import progress_bar
 

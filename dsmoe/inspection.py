@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 from .errors import TrainerError, printable
 from .model import GaussianModel
 from .options.config import CHECKPOINT_NAME, LEARNED, TrainConfig, holds_run
+from .options.early import check_ending
 from .results.evaluation import Measure, evaluate, psnr_alone
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import (
@@ -26,14 +28,13 @@ from .results.modelfile import (
 from .results.pictures import file_names
 from .results.rendering import Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
-from .results.video import check_ending
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points, upright
 from .scenes.scene import Scene, difference_of, load_cameras, load_scene, read_layout
 from .scenes.straight import pinhole_every
 from .starting import find_model
 from .system.device import check_device
-from .system.files import is_file, is_folder, write_json_atomically
+from .system.files import is_file, is_folder, write_atomically, write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.progress import progress_bar
 from .train import PER_VIEW_NAME
@@ -230,11 +231,13 @@ def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, sub
         paths = [os.path.join(folder, stem) for stem in stems]
         for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
             rendering = renderer(camera, outputs=tuple(outputs))
-            to_image(rendering.color).save(path + ".png")
+            write_atomically(path + ".png", partial(to_image(rendering.color).save, format="PNG"))
             if rendering.depth is not None:
-                np.save(path + endings["depth"], rendering.depth[0].cpu().numpy())
+                depth = rendering.depth[0].cpu().numpy()
+                write_atomically(path + endings["depth"], partial(np.save, arr=depth))
             if rendering.alpha is not None:
-                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path + endings["alpha"])
+                alpha = to_image(rendering.alpha.expand(3, -1, -1)).convert("L")
+                write_atomically(path + endings["alpha"], partial(alpha.save, format="PNG"))
     return [path + ".png" for path in paths]
 
 

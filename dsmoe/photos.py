@@ -143,6 +143,11 @@ def _keep(photos: str, names: Sequence[str], found: str, made: str) -> None:
         shutil.copyfile(source, target)
 
 
+def _refuse(error: OSError) -> None:
+    raise SceneError(f"{error.filename}: photographs there cannot be read ({error.strerror}); take the right to, or "
+                     "move the folder away")
+
+
 def photo_names(folder: str, output: str, say: Callable[[str], None] = lambda text: None) -> List[str]:
     """The photographs below a folder, by their paths in it; hidden files and the folder `output` are left out.
 
@@ -153,7 +158,8 @@ def photo_names(folder: str, output: str, say: Callable[[str], None] = lambda te
     made = os.path.join(os.path.realpath(output), "")
     if os.path.join(os.path.realpath(folder), "").startswith(made):
         raise SceneError(f"{folder} lies in {output}, the folder to write; name another one with -o")
-    names = sorted(os.path.relpath(os.path.join(place, name), folder) for place, _, files in os.walk(folder)
+    names = sorted(os.path.relpath(os.path.join(place, name), folder)
+                   for place, _, files in os.walk(folder, onerror=_refuse)
                    if not os.path.join(os.path.realpath(place), "").startswith(made)
                    for name in files if not name.startswith("."))
     found = [name for name in names if name.lower().endswith(ENDINGS)]

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shlex
 from typing import Any, Callable, Dict, List, NamedTuple, Optional
 
 from .errors import ConfigError, SceneError, TrainerError
@@ -19,6 +18,7 @@ from .starting import Found, Start, blend_options, change_of_blend, check_start,
 from .system.device import check_device
 from .system.files import is_folder
 from .system.output_folder import make_folder, only_one
+from .system.process import typed
 from .train import earlier_files, train
 
 UNTIL = 0.35  # as with --fast: removals end at 0.95 of this part of the iterations, moves at 1.33 of it
@@ -112,7 +112,7 @@ def _budget(start: Start, budget: Optional[int], keep: Optional[float]) -> int:
         raise ConfigError(f"--budget is {number}; it must be at least {LEAST}")
     if number > start.count:
         raise ConfigError(f"--budget is {number}; it must be at most {start.count}, which {start.path} has: to grow "
-                          f"it, `dsmoe train SCENE --init {shlex.quote(start.path)}`")
+                          f"it, `dsmoe train SCENE --init {typed(start.path)}`")
     return number
 
 
@@ -137,7 +137,7 @@ def _measure(config: TrainConfig, start: Start, say: Optional[Callable[[str], No
     except SceneError as error:
         if not found.teacher or config.scene != found.options.get("scene"):
             raise
-        raise SceneError(f"{error}; --scene {shlex.quote(str(found.teacher['scene']))} takes the model's renderings in "
+        raise SceneError(f"{error}; --scene {typed(str(found.teacher['scene']))} takes the model's renderings in "
                          "place of photographs") from error
     scene = load_scene(dataclasses.replace(config, init=""), progress, layout).starting_with(start)
     if say:

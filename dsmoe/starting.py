@@ -4,7 +4,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-import shlex
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Dict, NamedTuple, Optional, Sequence, Tuple
 
@@ -34,6 +33,7 @@ from .scenes.images import View
 from .scenes.modelfolder import CAMERAS, cfg_args_of, latest_model
 from .scenes.pointcloud import SH_C0, PointCloud
 from .system.files import is_file, is_folder
+from .system.process import typed
 
 if TYPE_CHECKING:
     from .scenes.scene import Scene
@@ -62,7 +62,7 @@ class Start:
     def blend_text(self) -> str:
         """Its blend mode, and how to declare one that the file does not record."""
         hint = "" if self.gaussians.blend_mode else (
-            f" (not recorded; `dsmoe export {shlex.quote(self.path)} --paper -o declared.ply` records the blend of the "
+            f" (not recorded; `dsmoe export {typed(self.path)} --paper -o declared.ply` records the blend of the "
             "paper's program, --blend-mode smoe --background-gate X that of another one)")
         return self.blend_mode + hint
 
@@ -134,7 +134,7 @@ def _read_start(path: str, *_: int) -> Start:
         raise TrainerError(f"{path}: it holds no Gaussians; name a model that has some")
     if bad:
         raise TrainerError(f"{path}: {bad:,} of its {count:,} Gaussians have a number that is NaN or infinite; `dsmoe "
-                           f"export {shlex.quote(path)} -o clean.glb` leaves such Gaussians out")
+                           f"export {typed(path)} -o clean.glb` leaves such Gaussians out")
     recorded = recorded_of(path, gaussians)
     gaussians = dataclasses.replace(gaussians, blend_mode=recorded.blend_mode)  # or of its folder
     mode = agreed_blend_mode(path, recorded.blend_mode, recorded.blend_mode or "alpha")

@@ -291,12 +291,21 @@ def _files(root: Path) -> Dict[str, bytes]:
     if not root.is_dir():
         raise PatchError(f"{root}: is not a folder; wanted is the checkout's, in which train.py or compress.py lies")
     paths = [*root.glob("submodules/*/setup.py"), *root.glob("submodules/*/backend.py")]
+    _check_readable(root)
     for above, folders, names in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")
                       and name not in ("submodules", "site-packages", "__pycache__")
+                      and _check_readable(Path(above, name))
                       and not any(Path(above, name, sign).exists() for sign in OF_NO_CHECKOUT)]
         paths += [Path(above, name) for name in names if name.endswith(".py")]
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(paths) if path.is_file()}
+
+
+def _check_readable(folder: Path) -> bool:
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise PatchError(f"{folder}: you may not read this folder, whose scripts a patch may be of; take the right to "
+                         "(chmod u+rx), or move it out of the checkout")
+    return True
 
 
 def _write(root: Path, files: Mapping[str, bytes], now: Mapping[str, bytes]) -> None:

@@ -73,7 +73,7 @@ struct Node {
   }
 
  private:
-  std::string shown() const { return io::printable(json.dump(-1, ' ', true, Json::error_handler_t::replace)); }
+  std::string shown() const { return io::printable(json.dump(-1, ' ', false, Json::error_handler_t::replace)); }
 };
 
 using Rotation = std::array<double, 9>;

@@ -1,9 +1,7 @@
 // dsmoe::core at work: a Frame is filled with pointers to the caller's arrays, and `forward` renders it.
-#include <algorithm>
-#include <cmath>
 #include <numeric>
 
-#include "dsmoe/constants.h"
+#include "dsmoe/gate.h"
 #include "dsmoe/rasterize.h"
 #include "renderer.h"
 
@@ -30,19 +28,15 @@ struct AroundTheSeam {
     const std::size_t count = projected.size();
     for (const float step : {width, -width}) {
       for (std::size_t i = 0; i < count; ++i) {
-        const float column = projected[i].mean.x, border = reach(i);
+        const ProjectedGaussian<float>& of = projected[i];
+        const float column = of.mean.x;
+        const float border = pixel_reach(static_cast<float>(radii[i]), of.opacity, of.squared_reach);
         if (radii[i] > 0 && (step > 0 ? column < border : column > width - 1 - border)) copy(i, step);
       }
     }
   }
 
  private:
-  /// Pixels, in every blend mode, the tails included.
-  float reach(std::size_t i) const {
-    const float by_tail = 2 * std::log(projected[i].opacity / kEveryTailAlpha);
-    return static_cast<float>(radii[i]) * std::sqrt(std::max({9.0f, by_tail, projected[i].squared_reach})) / 3;
-  }
-
   void copy(std::size_t i, float step) {
     const std::size_t row = features.size() / projected.size();
     ProjectedGaussian<float> moved = projected[i];

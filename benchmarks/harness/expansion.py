@@ -85,6 +85,7 @@ def expand(content: Any, folder: str, device: Optional[str] = None, iterations: 
         path = os.path.join(folder, content["scenes"])
         refuse(not os.path.isfile(path), f"scenes: {path}: no such file")
         content = {**content, "scenes": read_yaml(path)}
+        refuse(not isinstance(content["scenes"], list), f"{path}: it must hold a list of scenes")
     schema.check(content)
     content = {**schema.defaults(schema.Axes), **schema.defaults(schema.SuiteFile), **content}
     protocol = {**schema.defaults(schema.Protocol), **(content["protocol"] or {})}

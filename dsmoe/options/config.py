@@ -5,7 +5,6 @@ import dataclasses
 import glob
 import json
 import os
-import shlex
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 
@@ -23,6 +22,7 @@ from diff_smoe_rasterization.settings import (
 
 from ..errors import ConfigError
 from ..system.files import is_file, is_folder, write_text_atomically
+from ..system.process import typed
 from .choices import DEVICES, LENSES, MODEL
 from .importance_options import ImportanceOptions, parse_importance_options
 
@@ -405,7 +405,7 @@ class TrainConfig:
         differences = self.differences(later)
         if differences:
             raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `dsmoe train "
-                              f"--resume -o {shlex.quote(self.output)}` keeps the run's options; more --iterations "
+                              f"--resume -o {typed(self.output)}` keeps the run's options; more --iterations "
                               "extend it")
 
 

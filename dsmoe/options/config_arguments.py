@@ -42,6 +42,13 @@ def number(text: str) -> float:
     return _typed(float, text, KINDS[float])
 
 
+def file_name(text: str) -> str:
+    """What was typed, the name of a file or folder. Raises ArgumentTypeError if it is empty, as of a variable unset."""
+    if not text:
+        raise argparse.ArgumentTypeError("is empty; name a file or folder")
+    return text
+
+
 def _number_or_learned(text: str) -> Union[float, str]:
     return text if text == LEARNED else _typed(float, text, f"{KINDS[float]} or `{LEARNED}`")
 

@@ -3,21 +3,28 @@ from __future__ import annotations
 
 import argparse
 import os
-import shlex
 
 from ..errors import ConfigError, SceneError, TrainerError
-from ..system.files import check_output, is_file, is_folder
-from .choices import MODEL
+from ..system.files import check_output, check_place, is_file, is_folder
+from ..system.process import typed
+from .choices import MODEL, ORBIT_FRAMES, VIDEO_FPS
 from .config import TrainConfig, holds_run
 from .config_arguments import given_options
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+FILMED = (".mp4", ".gif", ".webp")  # what an orbit can be written as
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # nor is that a folder's name
 FROM_VIDEO = "of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
+MOST_FRAMES = 100_000  # 55 minutes
 LEAST_FPS, MOST_FPS = 0.01, 1000.0  # a .gif shows a frame for at most 655 s
 
 
 def check_early(arguments: argparse.Namespace) -> None:
     """Raises TrainerError as the command would, for what needs no torch to be seen. Not all of it is."""
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise TrainerError("the current folder has been removed; go to another one") from error
     command, scene = arguments.command, getattr(arguments, "scene", None)
     if command == "scene":
         check_photos(arguments.photos)
@@ -32,12 +39,29 @@ def check_early(arguments: argparse.Namespace) -> None:
         check_model(arguments.model)
         if holds_run(arguments.model):
             TrainConfig.load(arguments.model)
+        _check_meant(arguments)
+        if command == "render":
+            check_ending(arguments.output, arguments.orbit)
         if command == "render" and arguments.orbit:
-            check_orbit(arguments.frames, arguments.fps)
+            check_orbit(getattr(arguments, "frames", ORBIT_FRAMES), getattr(arguments, "fps", VIDEO_FPS))
         if command == "export" and arguments.output:
             check_output(arguments.output, arguments.overwrite)
     if command in ("simplify", "eval", "render", "export", "view") and scene:
         check_scene(scene)
+    if command in ("train", "simplify", "scene", "render", "export") and getattr(arguments, "output", None):
+        check_place(arguments.output, command == "export" or command == "render" and arguments.orbit
+                    and is_video(arguments.output))
+
+
+def _check_meant(arguments: argparse.Namespace) -> None:
+    """Raises TrainerError for an option that would do nothing."""
+    for name, other, partner in (("frames", "orbit", "--orbit"), ("fps", "orbit", "--orbit"),
+                                 ("bake_iterations", "bake", "--bake alpha")):
+        if hasattr(arguments, name) and not getattr(arguments, other):
+            raise TrainerError(f"--{name.replace('_', '-')} means something with {partner} alone; add that, or leave "
+                               "it out")
+    if getattr(arguments, "orbit", False) and arguments.split:
+        raise TrainerError("--split names cameras of the scene, and --orbit has its own; leave out one of the two")
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
@@ -55,7 +79,7 @@ def _check_run(folder: str) -> None:
     """Raises ConfigError if it is not the output folder of a training; the error says what renders another model."""
     if is_file(folder) or is_folder(os.path.join(folder, "point_cloud")) and not holds_run(folder):
         raise ConfigError(f"{folder} is not the output folder of `dsmoe train`, whose scene and options eval takes; "
-                          f"`dsmoe render {shlex.quote(folder)} --scene SCENE -o IMAGES` renders such a model")
+                          f"`dsmoe render {typed(folder)} --scene SCENE -o IMAGES` renders such a model")
     TrainConfig.load(folder)
 
 
@@ -84,9 +108,30 @@ def check_photos(photos: str) -> None:
                      f"{os.path.dirname(photos) or '.'}")
 
 
+def is_video(path: str) -> bool:
+    """Whether an orbit is written as one file, by the path's ending."""
+    return _ending(path) in FILMED
+
+
+def check_ending(path: str, orbit: bool) -> None:
+    """Raises TrainerError if a folder for images has the name of a file. orbit: whether a video could be made."""
+    ending = _ending(path)
+    if ending in FILMED and not orbit:
+        raise TrainerError(f"{path}: a video is written with --orbit; without it -o names a folder")
+    if ending in IMAGE_ENDINGS:
+        raise TrainerError(f"{path}: -o names a folder for images")
+    if ending in VIDEO_ENDINGS and ending not in FILMED:
+        raise TrainerError(f"{path}: a video can end in {', '.join(FILMED[:-1])} or {FILMED[-1]}; {ending} is not "
+                           "written")
+
+
+def _ending(path: str) -> str:
+    return os.path.splitext(path)[1].lower()
+
+
 def check_orbit(frames: int, fps: float) -> None:
     """Raises TrainerError if no video has so many frames, or so many a second."""
-    if frames < 1:
-        raise TrainerError(f"--frames is {frames}; it must be at least 1")
+    if not 1 <= frames <= MOST_FRAMES:
+        raise TrainerError(f"--frames is {frames}; it must be from 1 to {MOST_FRAMES}")
     if not LEAST_FPS <= fps <= MOST_FPS:
         raise TrainerError(f"--fps is {fps:g}; it must be from {LEAST_FPS:g} to {MOST_FPS:g}")

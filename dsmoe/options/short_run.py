@@ -2,10 +2,9 @@
 from __future__ import annotations
 
 import math
-import shlex
 from typing import Dict
 
-from ..system.process import command
+from ..system.process import command, typed
 
 FLAG = "--fast"
 # What two processor cores train in minutes.
@@ -25,7 +24,7 @@ def short_flags(width: int = 0, height: int = 0) -> str:
 
 def train_command(scene: str, model: str, device: str, width: int = 0, height: int = 0) -> str:
     """What to type to train on a scene with images of that size, if it is known: on a CPU with the short options."""
-    words = [command(), "train", shlex.quote(scene), "-o", shlex.quote(model)]
+    words = [command(), "train", typed(scene), "-o", typed(model)]
     return " ".join([*words, *([short_flags(width, height)] if device == "cpu" else [])])
 
 

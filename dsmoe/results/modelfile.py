@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from typing import NamedTuple, Optional, Tuple, Union
 
@@ -22,6 +21,7 @@ from ..errors import TrainerError, printable
 from ..model import GaussianModel, finite_rows
 from ..scenes.modelfolder import CFG_ARGS, cfg_args_of
 from ..system.files import new_file
+from ..system.process import typed
 from .glb import glb_gaussians
 from .shown import FAINT_BELOW, faint_comment, raw_of
 from .splat import splat_gaussians
@@ -174,7 +174,7 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
     if gate == LEARNED:
         if asked is None:
             raise TrainerError(f"{path} records no blend, and its folder's cfg_args says {blend_mode} with a learned "
-                               f"background gate, but not its value; declare it: `dsmoe export {shlex.quote(path)} "
+                               f"background gate, but not its value; declare it: `dsmoe export {typed(path)} "
                                f"--blend-mode {blend_mode} --background-gate X -o declared.ply`")
         gate = asked
     elif gate is None and recorded.blend_mode is not None:

@@ -1,7 +1,6 @@
 """Images one after the other as one file: .mp4 by imageio-ffmpeg, .gif and .webp by Pillow."""
 from __future__ import annotations
 
-import os
 from typing import Iterable
 
 import numpy as np
@@ -11,24 +10,7 @@ from ..errors import TrainerError
 from ..system.files import new_file
 from ..system.process import pip_install
 
-FORMATS = (".mp4", ".gif", ".webp")
 WEBP_QUALITY = 50  # of 100; 120 frames of a room, 480x320, take 1.9 MB
-OTHER_FORMATS = (".avi", ".mkv", ".mov", ".webm")  # which nobody means as a folder's name
-
-
-def is_video(path: str) -> bool:
-    """Whether the path's ending is one that `write_video` writes."""
-    return os.path.splitext(path)[1].lower() in FORMATS
-
-
-def check_ending(path: str, orbit: bool) -> None:
-    """Raises TrainerError if a folder for images has the name of a video. orbit: whether a video could be made."""
-    ending = os.path.splitext(path)[1].lower()
-    if ending in FORMATS and not orbit:
-        raise TrainerError(f"{path}: a video is written with --orbit; without it -o names a folder")
-    if ending in OTHER_FORMATS:
-        raise TrainerError(f"{path}: a video can end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}; {ending} is not "
-                           "written")
 
 
 def check_video(path: str) -> None:

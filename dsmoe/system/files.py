@@ -73,6 +73,21 @@ def check_output(path: str, overwrite: bool = True) -> None:
         raise TrainerError(f"{path} is there already; --overwrite replaces it, or choose another name with -o")
 
 
+def check_place(path: str, is_one_file: bool) -> None:
+    """Raises TrainerError if the folder `path`, or the file, cannot be made: a command says so before it works for it.
+
+    Of a file only its folder is looked at: `check_output` has the rest.
+    """
+    place = os.path.dirname(os.path.abspath(path)) if is_one_file else os.path.abspath(path)
+    while not os.path.lexists(place):
+        place = os.path.dirname(place)
+    if not os.path.isdir(place):
+        raise TrainerError(f"{path}: nothing can be written there: {place} is no folder; choose another name with -o")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise TrainerError(f"{path}: nothing can be written there: you may not write in {place}; choose another name "
+                           "with -o")
+
+
 @contextlib.contextmanager
 def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
     """Gives the name of a file to write beside `path`, with its ending; without an error it becomes `path`.
@@ -90,7 +105,8 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
         check_output(path, overwrite)
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename is not None and os.fsdecode(error.filename) == temporary:
+        named = error.filename is not None
+        if error.errno is not None and (not named or os.fsdecode(error.filename) == temporary):
             raise OSError(error.errno, error.strerror, path) from error
         raise
     finally:

@@ -35,17 +35,22 @@ def command() -> str:
     script = os.path.join(os.path.dirname(sys.executable), "dsmoe")
     if not os.path.isfile(script):
         return f"{shlex.quote(sys.executable)} -m {__name__.partition('.')[0]}"
-    return _typed(script)
+    return _shortest(script)
+
+
+def typed(path: str) -> str:
+    """How a path is typed in a shell, where it is to be no option."""
+    return shlex.quote(os.path.join(os.curdir, path) if path.startswith("-") else path)
 
 
 def pip_install(*packages: str) -> str:
     """What to type to bring packages into the environment that this process runs in."""
     pip = os.path.join(os.path.dirname(sys.executable), "pip")
-    typed = _typed(pip) if os.path.isfile(pip) else f"{shlex.quote(sys.executable)} -m pip"
-    return f"{typed} install {' '.join(packages)}"
+    program = _shortest(pip) if os.path.isfile(pip) else f"{shlex.quote(sys.executable)} -m pip"
+    return f"{program} install {' '.join(packages)}"
 
 
-def _typed(script: str) -> str:
+def _shortest(script: str) -> str:
     """The shortest that a shell finds it by: its name, its path from the current folder, or its whole path."""
     if shutil.which(os.path.basename(script)) == script:
         return os.path.basename(script)

@@ -5,6 +5,7 @@
 #include <random>
 
 #include "gaussians.h"
+#include "io/cursor.h"
 
 namespace {
 
@@ -23,9 +24,15 @@ struct Blend {
         bound(mode == "smoe" ? 0 : 0.03),
         start(mode == "smoe" ? 0.1 : 1),
         rate(mode == "smoe" ? 0.03 : 0.01) {
-    if (!has_gate) return;
-    if (gate != "learned") number = std::stod(gate);
-    if (gate != "learned") return;
+    if (!has_gate) {
+      if (!gate.empty()) throw std::invalid_argument("--background-gate is for --blend-mode smoe and smoe_eq7 only");
+      return;
+    }
+    if (!gate.empty() && gate != "learned") {
+      if (dsmoe::io::parse_number(gate, number) && number >= 0 && number <= 1e30) return;
+      throw std::invalid_argument("--background-gate is " + dsmoe::io::printable(gate) +
+                                  "; it must be learned, or a number from 0 to 1e30");
+    }
     logarithm.push_back({torch::full({1}, std::log(start - bound), device).requires_grad_(), rate});
   }
 
@@ -60,13 +67,18 @@ void show_progress(int iteration, int iterations, double seconds, double loss, i
 }
 
 void train(const std::string& folder, const std::string& output, std::map<std::string, std::string> options) {
+  const auto path = std::filesystem::path(output) / "point_cloud" / ("iteration_" + options["--iterations"]);
+  const std::string file = path / "point_cloud.ply";
+  if (std::filesystem::exists(file) && options.count("--overwrite") == 0)
+    throw std::invalid_argument(dsmoe::io::printable(file, file.size()) +
+                                " is there already; --overwrite replaces it, another OUT keeps it");
   const torch::Device device(options["--device"]);
   torch::manual_seed(std::stoull(options["--seed"]));
   std::mt19937_64 random(std::stoull(options["--seed"]));
+  Blend blend(options["--blend-mode"], options["--background-gate"], device);
   const Recipe recipe = Recipe::of(std::stoi(options["--iterations"]));
   const Scene scene = load_scene(folder, options["--images"], std::stoi(options["--divisor"]), device);
   Gaussians gaussians(scene, recipe);
-  Blend blend(options["--blend-mode"], options["--background-gate"], device);
 
   std::vector<const View*> left;  // of an epoch: each view is seen once before any comes again
   const auto begin = std::chrono::steady_clock::now();
@@ -94,9 +106,8 @@ void train(const std::string& folder, const std::string& output, std::map<std::s
     }
   }
 
-  const auto path = std::filesystem::path(output) / "point_cloud" / ("iteration_" + options["--iterations"]);
   std::filesystem::create_directories(path);
-  gaussians.save(path / "point_cloud.ply", blend.mode, blend.gate());
+  gaussians.save(file, blend.mode, blend.gate());
   evaluate(scene.test, gaussians, blend);
 }
 
@@ -104,17 +115,20 @@ void train(const std::string& folder, const std::string& output, std::map<std::s
 
 int main(int argc, char** argv) {
   std::map<std::string, std::string> options = {{"--blend-mode", "alpha"},
-                                                {"--background-gate", "learned"},
+                                                {"--background-gate", ""},
                                                 {"--iterations", "30000"},
                                                 {"--divisor", "1"},
                                                 {"--images", "images"},
                                                 {"--device", "cpu"},
                                                 {"--seed", "0"}};
   try {
-    if (argc < 3 || argc % 2 == 0) throw std::invalid_argument("usage: train SCENE OUT [--OPTION VALUE]...");
-    for (int i = 3; i < argc; i += 2) {
-      if (options.count(argv[i]) == 0) throw std::invalid_argument(std::string(argv[i]) + ": no such option");
-      options[argv[i]] = argv[i + 1];
+    if (argc < 3) throw std::invalid_argument("usage: train SCENE OUT [--overwrite] [--OPTION VALUE]...");
+    for (int i = 3; i < argc; ++i) {
+      const std::string name = argv[i];
+      const bool is_flag = name == "--overwrite";
+      if (!is_flag && options.count(name) == 0) throw std::invalid_argument("there is no option " + name);
+      if (!is_flag && ++i == argc) throw std::invalid_argument(name + " needs a value");
+      options[name] = argv[i];
     }
     train(argv[1], argv[2], options);
   } catch (const c10::Error& error) {

@@ -110,6 +110,28 @@ TYPED_TEST(GateOfMode, SquaredReachBoundsExactlyThePairsThatCount) {
   expect_squared_reach_is_exact<TypeParam::value>(1e-13);
 }
 
+// A round footprint of sigma 1, so of radius 3. It is felt where a pair counts or is a tail.
+TYPED_TEST(GateOfMode, PixelReachBoundsWhateverAPixelFeels) {
+  using Policy = Blend<TypeParam::value>;
+  int by_tails = 0;
+  for (const double opacity : test_opacities<double>()) {
+    const double squared = squared_reach(Policy::kCut, opacity, 0.0), reach = pixel_reach(3.0, opacity, squared);
+    EXPECT_GE(reach, 3);
+    for (double distance = reach + 1e-9; distance < reach + 3; distance += 0.1) {
+      const auto gate = evaluate_gate<TypeParam::value>(-0.5 * distance * distance, opacity, 0.0);
+      EXPECT_FALSE(gate.counts);
+      EXPECT_EQ(tail_of(gate, true, double(kEveryTailAlpha)), 0);
+    }
+    if (reach <= 3) continue;
+    const double inside = reach - 1e-9, logit = opacity * std::exp(-0.5 * inside * inside);
+    by_tails += logit < 1.001 * kEveryTailAlpha;
+    EXPECT_TRUE(logit >= kEveryTailAlpha || inside * inside < squared) << "further than it must";
+  }
+  EXPECT_GT(by_tails, 100);
+  EXPECT_EQ(pixel_reach(7.5f, 1e-6f, 36.0f), 15.0f);  // 6 sigma by a pair, 4.6 by the tails
+  for (const double opacity : {0.0, -1.0}) EXPECT_EQ(pixel_reach(6.0, opacity, double(kNoReach)), 6);
+}
+
 // The gate by its binary logarithm against the gate by the exponent, at squared distances that are not within `margin`
 // of the reach, where rounding decides. tolerance: of o G, relative.
 template <BlendMode kMode, class S> void expect_log_gate_is_the_gate(S margin, S tolerance) {

@@ -189,6 +189,23 @@ def test_copies_are_those_of_which_a_pixel_beyond_the_seam_can_see_something():
         assert copied[side].tolist() == [0, 2, 4] and not len(copied[1 - side])
 
 
+@pytest.mark.parametrize("turn", [5, 31])
+def test_footprints_as_wide_as_a_panorama_have_no_seam(turn):
+    """A reach of 62 of 64 columns, all around and back; a reach of ten panoramas has one copy on each side too."""
+    width, height = 64, 32
+    settings = settings_from_camera(None, torch.eye(3), torch.zeros(3), width, height, camera_model="equirectangular",
+                                    blend_mode="smoe_eq7")
+    gates = torch.tensor([[9.25, 16, 1 / 169, 0, 1 / 9, 0.5, 23, 1], [50, 9, 1 / 64, 0, 1 / 16, 0.6, 23, 2]]).double()
+    prints = Footprints(gates, torch.eye(2, 3).double(), torch.tensor([39, 24], dtype=torch.int32))
+    turned = prints._replace(gates=gates.clone())
+    turned.gates[:, 0] = (gates[:, 0] + turn) % width
+    images = [blend_footprints(each.around(width), settings._replace(bg=settings.bg.double())).color
+              for each in (prints, turned)]
+    assert_close(images[1], images[0].roll(turn, 2), FLOAT64_TOLERANCE, "color")
+    wide = prints._replace(radii=prints.radii * 10)
+    assert [index.tolist() for index in wide.copied(width)] == [[0, 1], [0, 1]]
+
+
 def test_a_batch_takes_views_of_different_models():
     scene = lens_scene("smoe", "fisheye").to(torch.float32)
     views = [scene.settings] + [scene.settings._replace(**{"distortion": (), "principal_point": None, **lens})

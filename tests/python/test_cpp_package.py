@@ -120,6 +120,30 @@ def test_a_strangers_project_uses_what_cmake_installs(tmp_path):
     run(tmp_path / "consumer" / "consumer_torch")
 
 
+@needs_cmake
+@pytest.mark.parametrize("library_folder", ["lib", "lib/triplet"])
+def test_what_is_installed_finds_the_shared_libraries_beside_it(tmp_path, library_folder):
+    """By the folders that CMake's file API says it installs to, and the linker's words for where a program looks."""
+    reply = tmp_path / ".cmake" / "api" / "v1" / "reply"
+    query = reply.parent / "query" / "codemodel-v2"
+    query.parent.mkdir(parents=True)
+    query.touch()
+    run("cmake", "-S", ROOT, "-B", tmp_path, "-DBUILD_SHARED_LIBS=ON", "-DDSMOE_CUDA=OFF", "-DDSMOE_BUILD_TESTS=OFF",
+        "-DCMAKE_BUILD_WITH_INSTALL_RPATH=ON", f"-DCMAKE_INSTALL_LIBDIR={library_folder}")
+    linked = set()
+    for path in reply.glob("target-*.json"):
+        target = json.loads(path.read_text())
+        if "install" not in target:
+            continue
+        folder = target["install"]["destinations"][0]["path"]
+        words = " ".join(fragment["fragment"] for fragment in target["link"]["commandFragments"])
+        looks = [os.path.normpath(folder + rest)
+                 for rest in re.findall(r"(?:ORIGIN|loader_path)([\w./-]*)", words)]
+        assert library_folder in looks, (target["name"], words)
+        linked.add(target["name"])
+    assert {"dsmoe_core", "dsmoe_io"} <= linked  # and the tools, where there is OpenCV
+
+
 def what_is_found(folder, asked, absent="", before="", prefixes=""):
     """Whether find_package finds this package without the package `absent`, and the targets that come of it."""
     (folder / "CMakeLists.txt").write_text(f"""cmake_minimum_required(VERSION 3.21)
@@ -274,18 +298,49 @@ def shows_a_model(program, folder):
     assert result.returncode == 1 and "other.ply" in result.stderr and result.stderr.count("\n") == 1
 
 
-@needs_cmake
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [[], ["--blend-mode", "smoe"], ["--blend-mode", "smoe", "--background-gate", "0"]])
-def test_the_cpp_trainer_is_as_good_as_pythons(tmp_path_factory, tmp_path, options):
-    """Same scene, recipe and number of steps; the order of views and the places of split Gaussians are others."""
+@pytest.fixture
+def cpp_trainer(tmp_path_factory):
+    """The program of examples/libtorch, built once."""
     folder = tmp_path_factory.getbasetemp() / "cpp_trainer"
     if not (folder / "train").is_file():
         build(ROOT / "examples" / "libtorch", folder, "-DCMAKE_BUILD_TYPE=Release")
+    return folder / "train"
+
+
+@needs_cmake
+@pytest.mark.slow
+def test_the_cpp_trainer_refuses_what_it_would_ignore_or_lose(cpp_trainer, tmp_path):
+    write_synthetic_scene(str(tmp_path / "scene"), views=9, width=20, height=15, points=50, supersampling=1)
+
+    def said(*options, status=1):
+        done = subprocess.run([str(cpp_trainer), str(tmp_path / "scene"), str(tmp_path / "out"), "--iterations", "2",
+                               *options], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, universal_newlines=True)
+        assert done.returncode == status, done.stderr
+        return done.stderr
+
+    assert said("--background-gate", "0.5") == "--background-gate is for --blend-mode smoe and smoe_eq7 only\n"
+    assert (said("--blend-mode", "smoe", "--background-gate", "0.5x")
+            == '--background-gate is "0.5x"; it must be learned, or a number from 0 to 1e30\n')
+    assert said("--seed") == "--seed needs a value\n" and said("--sed", "0") == "there is no option --sed\n"
+    assert not (tmp_path / "out").exists()
+    said(status=0)
+    model = tmp_path / "out" / "point_cloud" / "iteration_2" / "point_cloud.ply"
+    first = model.read_bytes()
+    assert said("--seed", "1") == f'"{model}" is there already; --overwrite replaces it, another OUT keeps it\n'
+    assert model.read_bytes() == first
+    said("--overwrite", "--seed", "1", "--blend-mode", "smoe", status=0)
+    assert model.read_bytes() != first
+
+
+@needs_cmake
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [[], ["--blend-mode", "smoe"], ["--blend-mode", "smoe", "--background-gate", "0"]])
+def test_the_cpp_trainer_is_as_good_as_pythons(cpp_trainer, tmp_path, options):
+    """Same scene, recipe and number of steps; the order of views and the places of split Gaussians are others."""
     write_synthetic_scene(str(tmp_path / "scene"), views=24, width=100, height=75, points=1000, supersampling=1)
-    printed = run(folder / "train", tmp_path / "scene", tmp_path / "cpp", "--iterations", "300", *options)
+    printed = run(cpp_trainer, tmp_path / "scene", tmp_path / "cpp", "--iterations", "300", *options)
     if not options:
-        wrong = subprocess.run([str(folder / "train"), str(tmp_path / "scene"), str(tmp_path / "no"), "--blend-mode",
+        wrong = subprocess.run([str(cpp_trainer), str(tmp_path / "scene"), str(tmp_path / "no"), "--blend-mode",
                                 "smo"], stderr=subprocess.PIPE, universal_newlines=True)
         assert wrong.returncode == 1 and "'smo'; it must be one of alpha" in wrong.stderr
         assert wrong.stderr.count("\n") == 1, "without the trace of LibTorch's errors"

@@ -120,6 +120,23 @@ def test_a_wall_by_hand(dtype, tolerance):
     assert_close(importance.shares, torch.tensor([first, second], dtype=torch.float64), tolerance, "shares")
 
 
+@pytest.mark.parametrize("behind", [0.5, 0.01, 0.001])
+def test_float32_errs_by_the_rounding_of_a_colour_over_the_part_that_is_left(behind):
+    """A wall of 0.99, and what it hides: 0.5 % to 0.001 % of the pixel."""
+    costs = []
+    for dtype in (torch.float32, torch.float64):
+        settings = facing_camera("smoe", 1, 1)
+        settings = settings._replace(**{name: getattr(settings, name).to(dtype)
+                                        for name in ("bg", "viewmatrix", "projmatrix", "campos")})
+        inputs = on_axis((2.0, 3.0), (0.99, behind), [(0.9, 0.2, 0.4), (0.3, 0.7, 0.1)], 0.04)
+        splats = rasterize_with_splats(settings=settings, **{name: value.float().to(dtype)
+                                                             for name, value in inputs.items()})[1]
+        costs.append(splats.importance().removal_costs[0].item())
+    left = 0.01 * behind / (0.99 + 0.01 * behind)
+    # Two roundings of three numbers below 1: of the colour, and of its distance to the wall's.
+    assert abs(costs[0]**0.5 - costs[1]**0.5) < 2 * 3**0.5 * 2**-24 / left and costs[1] > 0.6
+
+
 @with_removal
 def test_float32_keeps_the_digits_that_rank_gaussians(mode):
     scene = random_scene(mode, 200, 64, 48, scale=0.1)

@@ -16,20 +16,41 @@ template <typename T> bool parse_all(std::string_view text, T& value) {
   return error == std::errc() && end == text.data() + text.size() && !text.empty();
 }
 
+// Bytes of the character of UTF-8 that `text` begins with; 0 if it begins with a control character or with none.
+std::size_t printable_bytes(std::string_view text) {
+  const auto byte = [&](std::size_t i) { return static_cast<std::uint32_t>(static_cast<unsigned char>(text[i])); };
+  const std::uint32_t first = byte(0);
+  if (first < 0x80) return first >= ' ' && first <= '~' ? 1 : 0;
+  const std::size_t size = first < 0xe0 ? 2 : first < 0xf0 ? 3 : 4;
+  if (first < 0xc2 || first > 0xf4 || size > text.size()) return 0;
+  std::uint32_t code = first & (0x7f >> size);
+  for (std::size_t i = 1; i < size; ++i) {
+    if (byte(i) >> 6 != 2) return 0;
+    code = code << 6 | (byte(i) & 0x3f);
+  }
+  constexpr std::uint32_t kLeast[] = {0xa0, 0x800, 0x10000};  // below are controls, and what takes fewer bytes
+  const bool surrogate = code >= 0xd800 && code < 0xe000;
+  return code >= kLeast[size - 2] && code <= 0x10ffff && !surrogate ? size : 0;
+}
+
 }  // namespace
 
 std::string printable(std::string_view text, std::size_t longest) {
   std::string result = "\"";
-  for (const char c : text.substr(0, longest)) {
-    if (c >= ' ' && c <= '~') {
-      result += c;
-      continue;
+  std::size_t at = 0;
+  while (at < text.size()) {
+    const std::size_t size = printable_bytes(text.substr(at)), step = std::max<std::size_t>(size, 1);
+    if (at + step > longest) break;
+    if (size > 0) {
+      result += text.substr(at, size);
+    } else {
+      char escaped[5];
+      std::snprintf(escaped, sizeof(escaped), "\\x%02x", static_cast<unsigned char>(text[at]));
+      result += escaped;
     }
-    char escaped[5];
-    std::snprintf(escaped, sizeof(escaped), "\\x%02x", static_cast<unsigned char>(c));
-    result += escaped;
+    at += step;
   }
-  return result + (text.size() > longest ? "...\"" : "\"");
+  return result + (at < text.size() ? "...\"" : "\"");
 }
 
 bool parse_number(std::string_view text, double& value) {

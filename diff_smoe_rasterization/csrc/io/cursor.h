@@ -37,7 +37,8 @@ template <typename T> void append_little_endian(std::string& bytes, T value) {
   bytes.append(copy, sizeof(T));
 }
 
-/// Returns text as it may stand in a message: quoted, cut after `longest` bytes, unprintable ones as \xNN.
+/// Returns text as it may stand in a message: quoted, cut before a character that ends after `longest` bytes. Control
+/// characters, and bytes that are not UTF-8, are \xNN.
 std::string printable(std::string_view text, std::size_t longest = 60);
 
 /// Parses the whole of `text`, in the C locale whatever the program's. False if it is not a number or out of

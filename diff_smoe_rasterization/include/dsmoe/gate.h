@@ -62,6 +62,13 @@ template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
   return least_alpha > S(0) ? min(by_gate, by_alpha) : by_gate;
 }
 
+// Pixels from a footprint's centre within which every pixel lies that feels it in any mode, by its tails too. radius:
+// 3 sigma along the longer axis.
+template <class S> DSMOE_HD S pixel_reach(S radius, S opacity, S squared_reach) {
+  const S by_tail = opacity > S(0) ? S(2) * log(opacity / S(kEveryTailAlpha)) : S(kNoReach);
+  return radius * sqrt(max(S(9), max(by_tail, squared_reach))) / S(3);
+}
+
 // A pair that counts is near if alpha >= 1/255, and within 3 sigma if alpha >= 1/1020; else it is faint. A mode
 // with kNearFirst blends the faint pairs of a pixel only where its near pairs have a small gate sum.
 //

@@ -22,7 +22,7 @@
 // A pixel that no other Gaussian and no background's gate is in shows the background's colour. This is exact but for
 // Gaussians behind a pixel's early stop, which are not walked, and for owners behind a pair that have less than
 // 1e-6 of W in float: their weights are lost in the rounding of W. In smoe_tn that is 1e-6 of sum alpha, divided by
-// 1 - alpha_k.
+// 1 - alpha_k. C' - C also errs by the rounding of C, divided by what is left of D: by (1 - alpha_k) D'_k / D.
 #pragma once
 
 #include "dsmoe/pixel.h"

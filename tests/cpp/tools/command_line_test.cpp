@@ -52,8 +52,8 @@ TEST_F(CheckOutput, TakesAFreeName) {
 }
 
 TEST_F(CheckOutput, ReplacesAFileOnlyWhereAsked) {
-  const std::string file = made("thesis.png");
-  EXPECT_NE(refusal(file, false).find("thesis.png\" is there already; --overwrite"), std::string::npos);
+  const std::string file = made("thèse.png");
+  EXPECT_NE(refusal(file, false).find("thèse.png\" is there already; --overwrite"), std::string::npos);
   EXPECT_EQ(refusal(file, true), "");
 }
 

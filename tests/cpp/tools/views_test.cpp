@@ -113,6 +113,7 @@ TEST(JsonViews, RefuseWithPlaceAndReason) {
   expect_refused(kInria, "64", "1e300", ": camera 0: `width`", "1e+300");
   expect_refused(kInria, "50", "0", ": camera 0: `fx`", "must be a number from");
   expect_refused(kInria, "50", "true", ": camera 0: `fx`", "true");
+  expect_refused(kInria, "50", "\"µ\"", ": camera 0: `fx`", "µ");
   expect_refused(kInria, "[5, 6, 7]", "[5, 6]", ": camera 0: `position`", "3 numbers");
   expect_refused(kInria, "[5, 6, 7]", "7", ": camera 0: `position`", "3 numbers");
   expect_refused(kInria, "[0, 0, -1]", "[0, 0, 1]", ": camera 0: `rotation`", "mirrors");

@@ -70,7 +70,7 @@ def test_the_papers_program_is_a_word_among_the_blends(content):
 
 
 @pytest.mark.parametrize("name", ["table1", "table3", "fig4", "fig5"])
-def test_the_papers_suites_run_by_name_on_scenes_at_hand(name, monkeypatch):
+def test_the_papers_suites_run_by_name_on_scenes_at_hand(name, monkeypatch, tmp_path):
     """As a trial too, on the CPU, where checkouts cannot follow: the native trainer is chosen."""
     monkeypatch.setenv("DSMOE_DATA", "/data")
     for variable in ("DSMOE_TRAINERS", "DSMOE_SCENES"):
@@ -84,6 +84,9 @@ def test_the_papers_suites_run_by_name_on_scenes_at_hand(name, monkeypatch):
                       {"alpha", "smoe paper", "smoe learned"})
     with pytest.raises(BenchError, match="--scenes captuers: no such file, and no scenes that are shipped .captures, "):
         load_suite(find_suite(name), scenes="captuers")
+    (tmp_path / "scenes.yaml").write_text("name: suite")
+    with pytest.raises(BenchError, match="scenes.yaml: it must hold a list of scenes"):
+        load_suite(find_suite(name), scenes=str(tmp_path / "scenes.yaml"))
     with pytest.raises(BenchError, match="--only method=navite: the suite has native"):
         load_suite(find_suite(name), methods=["navite"])
 

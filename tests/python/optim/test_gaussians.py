@@ -85,6 +85,19 @@ def test_statistics_count_views_and_screen_space_gradients(device, dtype):
     torch.testing.assert_close(gradient_sum.double(), expected_sum, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_reach_of_a_footprint_with_its_tails(device, dtype):
+    """Where opacity G is 2^-35, or further if a pair counts there, and never within the radius of 3 sigma."""
+    radii = torch.tensor([3, 3, 9, 30, 0, 6, 6], dtype=torch.int32)
+    values = torch.tensor([[0.5, 11], [1e-6, 36], [1e-11, -4], [1e-11, 16], [0.5, 11], [0, -1e30], [-1, -1e30]],
+                          dtype=dtype)
+    found = torch.ops.diff_smoe_rasterization.pixel_reach(radii, values[:, 0], values[:, 1])
+    expected = torch.tensor([math.sqrt(2 * math.log(0.5 * 2**35)), 6, 9, 40, 0, 6, 6], dtype=dtype)
+    torch.testing.assert_close(found, expected, rtol=1e-6 if dtype == torch.float32 else 1e-14, atol=0)
+    with pytest.raises(ValueError, match=r"pixel_reach: squared_reaches has shape \[6\]; it must be \[7\]"):
+        torch.ops.diff_smoe_rasterization.pixel_reach(radii, values[:, 0], values[1:, 1])
+
+
 def test_statistics_that_were_saved_for_a_backward_pass_are_not_changed_unseen(device):
     factor = torch.ones(4, requires_grad=True)
     for place in range(2):

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import unprivileged
 from checkouts import ARGS, CHECKOUT, GR, PATCHED, RENDER, RENDERER, TRAIN, contents, digest, make, marked, refused
 
 from dsmoe import patches
@@ -326,7 +327,8 @@ def test_a_folder_that_may_not_be_written_is_named_before_anything_is(tmp_path, 
     access = os.access
     make(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(os, "access", lambda path, mode: Path(path).name != "gaussian_renderer" and access(path, mode))
+        patch.setattr(os, "access", lambda path, mode: access(path, mode) and (
+            mode != os.W_OK or Path(path).name != "gaussian_renderer"))
         refused(tmp_path, "gaussian_renderer: you may not write in this folder")
 
 
@@ -374,6 +376,17 @@ def test_a_link_out_of_the_checkout_is_refused(tmp_path):
     (tmp_path / "render.py").write_text(RENDER)
     (folder / "render.py").symlink_to(tmp_path / "render.py")
     refused(folder, "render.py: is a link to", "outside the checkout")
+
+
+@pytest.mark.parametrize("name, mode", [("output", 0), ("a/b", 0o400), ("gaussian_renderer", 0o100), (".", 0)])
+def test_a_folder_that_may_not_be_read_is_named(tmp_path, name, mode):
+    locked = make(tmp_path / "checkout") / name
+    locked.mkdir(parents=True, exist_ok=True)
+    locked.chmod(mode)
+    done = unprivileged.dsmoe("patch", "check", tmp_path / "checkout")
+    locked.chmod(0o700)
+    assert (done.returncode, done.stdout) == (1, "") and done.stderr.count("\n") == 1
+    assert f"{locked}: you may not read this folder" in done.stderr and "chmod u+rx" in done.stderr
 
 
 SCRIPTS = {  # of the user's own: text, what is said of it

@@ -17,9 +17,11 @@ from io import BytesIO, TextIOWrapper
 import numpy as np
 import pytest
 import torch
+import unprivileged
 from PIL import Image
 
 import diff_smoe_rasterization
+import dsmoe.__main__
 from diff_smoe_rasterization import io
 from dsmoe import cli, inspection
 from dsmoe.cli import main
@@ -205,7 +207,11 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         f"eval|{ply}": f"`dsmoe render {ply} --scene SCENE -o IMAGES` renders",
         "eval|my model": "`dsmoe render 'my model' --scene", f"render|{ply}|-o|o.gif|--orbit|--fps|0": "--fps is 0",
         f"render|{ply}|-o|o|--scene|nowhere": "scene nowhere: no such folder", "view|nowhere": "no such file or folder",
-        "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it"}
+        "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it",
+        f"render|{ply}|-o|o|--frames|3": "--frames means something with --orbit alone",
+        f"render|{ply}|-o|o|--fps|3": "--fps means something with --orbit alone",
+        f"render|{ply}|-o|o|--orbit|--split|test": "leave out one of the two",
+        f"export|{ply}|--bake-iterations|3": "--bake-iterations means something with --bake alpha alone"}
     listed = {"": "measure a trained run again", "patch": "take the patch out of every file",
               "bench": "run what is not done yet of a suite"}
     package = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))
@@ -221,10 +227,17 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
 @pytest.mark.parametrize("words, error", [
     ("train s -o o --iterations 1e4", "argument --iterations: is '1e4'; it must be a whole number\n"),
     ("train s -o o --opacity-lr 0,1", "argument --opacity-lr: is '0,1'; it must be a number\n"),
-    ("view o --port 80x", "argument --port: is '80x'; it must be a whole number\n")])
-def test_what_is_no_number_is_told(words, error, capsys):
+    ("view o --port 80x", "argument --port: is '80x'; it must be a whole number\n"),
+    *((words, f"argument {name}: is empty; name a file or folder\n") for words, name in (
+        ("export m.ply -o ''", "-o/--output"), ("render m.ply -o ''", "-o/--output"), ("view ''", "MODEL"),
+        ("simplify m.ply --budget 9 -o ''", "-o/--output"), ("train '' -o o", "SCENE"), ("eval ''", "OUT"),
+        ("train s -o ''", "-o/--output"), ("scene p -o ''", "-o/--output"), ("scene '' -o o", "PHOTOS"),
+        ("bench run smoke -o ''", "-o/--output"), ("bench report r -o ''", "-o/--output"),
+        ("bench run ''", "SUITE"), ("bench report ''", "RESULTS"), ("patch check ''", "PATH"),
+        ("eval o --scene ''", "--scene"), ("render m.ply -o o --scene ''", "--scene")))])
+def test_what_is_no_number_or_no_name_is_told(words, error, capsys):
     with pytest.raises(SystemExit):
-        main(words.split())
+        main(shlex.split(words))
     assert capsys.readouterr().err.endswith(error)
 
 
@@ -660,9 +673,6 @@ def test_resume_of_a_folder_alone_has_the_options_of_the_run(trained, tmp_path, 
         main(["train", "-o", output])
     assert "SCENE and -o OUT are needed" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["train", "scene", "-o", ""])  # as of a shell's variable that is not set
-    assert "SCENE and -o OUT are needed" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
         main(["train", "--resume", output, "--scale-recipe"])
     assert "--scale-recipe needs SCENE" in capsys.readouterr().err
 
@@ -715,8 +725,36 @@ def test_an_output_that_cannot_be_written_is_one_line(trained, scene, tmp_path, 
     with open(path, "w", encoding="utf-8") as file:
         file.write("no folder")
     for arguments in (["train", scene, "-o", path], ["train", scene, "-o", os.path.join(path, "below")],
-                      ["render", trained, "-o", path]):
-        assert path in fails(capsys, *arguments)
+                      ["render", trained, "-o", path], ["simplify", trained, "--budget", "9", "-o", path],
+                      ["scene", os.path.join(scene, "images"), "-o", path],
+                      ["export", trained, "-o", os.path.join(path, "a.ply")],
+                      ["render", trained, "--orbit", "-o", os.path.join(path, "a.gif")]):
+        assert f"{path} is no folder; choose another name with -o" in fails(capsys, *arguments)
+
+
+@pytest.mark.parametrize("words", [["info"], ["render", "o", "-o", "i"], ["bench", "run", "smoke"],
+                                   ["patch", "check", "p"]])
+def test_a_current_folder_that_is_gone_is_told(words, tmp_path, capsys, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert "the current folder has been removed; go to another one" in fails(capsys, *words)
+
+
+def test_a_folder_that_may_not_be_written_or_read_is_told_before_anything_is_made(trained, scene, tmp_path):
+    locked, photos = tmp_path / "locked", tmp_path / "photos"
+    shutil.copytree(os.path.join(scene, "images"), str(photos))
+    (photos / "more").mkdir(mode=0)
+    locked.mkdir(mode=0o500)
+    for words in (["train", scene, "-o", locked / "new"], ["render", trained, "-o", locked],
+                  ["render", trained, "--orbit", "-o", locked / "a.gif"], ["export", trained, "-o", locked / "a.ply"],
+                  ["simplify", trained, "--budget", "9", "-o", locked / "a" / "b"]):
+        done = unprivileged.dsmoe(*words)
+        assert (done.returncode, done.stdout) == (1, "") and done.stderr.endswith(
+            f"{words[-1]}: nothing can be written there: you may not write in {locked}; choose another name with -o\n")
+    done = unprivileged.dsmoe("scene", photos, "-o", tmp_path / "made")
+    assert done.returncode == 1 and f"{photos / 'more'}: photographs there cannot be read" in done.stderr
+    assert sorted(os.listdir(tmp_path)) == ["locked", "photos"] and not os.listdir(locked)
 
 
 def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
@@ -800,6 +838,22 @@ def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, mon
             assert mine.read() == theirs.read()
 
 
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_an_interrupted_rendering_leaves_whole_images(trained, tmp_path, monkeypatch, ctrl_c_works, number, status):
+    words, save = ["render", trained, "-o", str(tmp_path)], Image.Image.save
+
+    def interrupted_save(self, file, **options):
+        save(self, file, **options)
+        if (tmp_path / "view_000.png").exists():  # the second one is not whole yet
+            os.kill(os.getpid(), number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Image.Image, "save", interrupted_save)
+        assert main(words) == status
+    assert sorted(os.listdir(tmp_path)) == [".dsmoe.json", ".dsmoe.lock", "view_000.png"]
+    assert main(words) == 0 and "view_008.png" in os.listdir(tmp_path)
+
+
 def test_names_of_images_need_not_be_utf_8(scene, tmp_path, capsys):
     """One of the training and one of the test, as an old camera's disk has them: each command takes them."""
     folder, output = str(tmp_path / "scene"), str(tmp_path / "out")
@@ -838,6 +892,15 @@ def test_names_that_a_terminal_cannot_print_end_no_command(scene, tmp_path, monk
     out, errors = (stream.buffer.read() for stream in streams)
     assert (b"export 'run\xff' -o" if encoding == "utf-8" else b"export 'run\\udcff' -o") in out
     assert errors.count(b"\n") == 2 and b"a\\udcff holds no config.json" in errors
+
+
+def test_an_interruption_while_the_command_is_loaded_shows_no_traceback(monkeypatch, capsys):
+    class Interrupted:
+        def __getattr__(self, name):
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "dsmoe.cli", Interrupted())
+    assert dsmoe.__main__.main() == 130 and capsys.readouterr().err == "\ndsmoe: interrupted\n"
 
 
 def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):

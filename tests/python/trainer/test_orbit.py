@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import resource
 
 import numpy as np
 import pytest
@@ -165,6 +166,8 @@ def test_an_mp4_plays_every_frame(tmp_path):
     ("a.gif", ["--depth"], "a video has room for colours only"), ("a", ["--frames", "0"], "--frames is 0"),
     *(("a.gif", ["--fps", fps], f"--fps is {fps}; it must be from 0.01 to 1000")
       for fps in ("0", "1e-308", "0.009", "-1", "1001", "inf", "nan")),
+    ("a.gif", ["--frames", "100001"], "--frames is 100001; it must be from 1 to 100000"),
+    ("a.png", [], "a.png: -o names a folder for images"),
     ("a.mov", [], "a video can end in .mp4, .gif or .webp; .mov is not written")])
 def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, arguments, text):
     assert orbit(model, tmp_path / output, *arguments) == 1
@@ -175,6 +178,24 @@ def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, argum
 @pytest.mark.parametrize("fps", ["0.01", "1000"])
 def test_the_slowest_and_the_fastest_video_are_written(model, tmp_path, fps, ending):
     assert orbit(model, tmp_path / f"a{ending}", "--fps", fps, "--frames", "2") == 0
+
+
+@pytest.fixture
+def little_room():
+    """No file may have more than 700 bytes, as on a disk that is full."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (700, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("name, left", [("a.gif", []), ("a", ["a"])])
+def test_a_full_disk_leaves_no_half_of_a_file(model, tmp_path, capsys, little_room, name, left):
+    assert orbit(model, tmp_path / name) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{tmp_path / name}" in said and said.endswith("File too large\n")
+    assert sorted(os.listdir(tmp_path)) == [*left, "model.ply"]
+    assert not left or sorted(os.listdir(tmp_path / name)) == [".dsmoe.json", ".dsmoe.lock"]
 
 
 def test_an_mp4_without_its_library_is_refused(model, tmp_path, capsys, monkeypatch):

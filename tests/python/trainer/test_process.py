@@ -26,6 +26,11 @@ def test_a_training_on_a_gpu_has_one_thread_of_the_host_and_one_on_the_cpu_has_a
         torch.set_num_threads(before)
 
 
+def test_a_path_is_typed_so_that_a_shell_takes_it_for_one_and_the_command_for_no_option():
+    assert [process.typed(path) for path in ("run", "-run", "a b", "-a b", "/-x")] == [
+        "run", "./-run", "'a b'", "'./-a b'", "/-x"]
+
+
 def test_a_bar_in_a_file_is_a_line_a_minute(monkeypatch):
     log, now = io.StringIO(), [0.0]
     monkeypatch.setattr("sys.stderr", log)

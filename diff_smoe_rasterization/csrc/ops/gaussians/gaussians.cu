@@ -24,6 +24,7 @@ template <class Pass> void for_each_gaussian(const Pass& pass, int64_t count, vo
   template void for_each_gaussian(const Activate<S>&, int64_t, void*);         \
   template void for_each_gaussian(const ActivateBackward<S>&, int64_t, void*); \
   template void for_each_gaussian(const AddView<S>&, int64_t, void*);          \
+  template void for_each_gaussian(const PixelReach<S>&, int64_t, void*);       \
   template void for_each_gaussian(const GateStep<S>&, int64_t, void*);         \
   template void for_each_gaussian(const StepInputs<S>&, int64_t, void*);
 DSMOE_INSTANTIATE(float)

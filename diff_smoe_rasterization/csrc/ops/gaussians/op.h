@@ -114,6 +114,27 @@ void add_view(const Tensor& dL_dmeans2D, const Tensor& radii, const Tensor& grad
 }
 
 template <class Backend>
+Tensor pixel_reach(const Tensor& radii, const Tensor& opacities, const Tensor& squared_reaches) {
+  const Expect expect("pixel_reach", "opacities", opacities);
+  expect("radii", radii, {"N"}, kInt);
+  expect("opacities", opacities, {radii.size(0)});
+  expect("squared_reaches", squared_reaches, {radii.size(0)});
+  const DeviceGuard guard(radii.device());
+  const Tensor dense[] = {radii.contiguous(), opacities.contiguous(), squared_reaches.contiguous()};
+  const Tensor reach = empty({radii.size(0)}, opacities);
+  dispatch_real(opacities, [&](auto zero) {
+    using scalar_t = decltype(zero);
+    PixelReach<scalar_t> pass = {};
+    pass.radii = dense[0].data_ptr<int32_t>();
+    pass.opacities = dense[1].data_ptr<scalar_t>();
+    pass.squared_reaches = dense[2].data_ptr<scalar_t>();
+    pass.reach = reach.data_ptr<scalar_t>();
+    for_each_gaussian<Backend>(pass, radii.size(0));
+  });
+  return reach;
+}
+
+template <class Backend>
 void gate_adam(const Tensor& logarithm, const Tensor& moment, const Tensor& square, const Tensor& gate,
                const Tensor& gradient, double rate, double root_scale, double beta1, double beta2, double epsilon,
                double bound, double limit) {
@@ -195,6 +216,9 @@ template <class Backend, class Ops> void gaussians_ops(Ops& ops) {
   // For densification: adds |dL_dmeans2D[:, :2]| and 1 where radii > 0. All [N] but dL_dmeans2D [N, 3].
   ops.template add<&add_view<Backend>>(
       "add_view(Tensor dL_dmeans2D, Tensor radii, Tensor(a!) gradient_sum, Tensor(b!) view_count) -> ()");
+  // Pixels from a footprint's centre within which any mode feels it. All [N].
+  ops.template add<&pixel_reach<Backend>>(
+      "pixel_reach(Tensor radii, Tensor opacities, Tensor squared_reaches) -> Tensor");
   // One step of Adam on p, and gate = bound + exp(p). All tensors [1]; gradient: by the gate. limit: of |p|.
   ops.template add<&gate_adam<Backend>>(
       "gate_adam(Tensor(a!) logarithm, Tensor(b!) moment, Tensor(c!) square, Tensor(d!) gate, Tensor gradient, "

@@ -3,6 +3,7 @@
 
 #include <cstdint>
 
+#include "dsmoe/gate.h"
 #include "dsmoe/hd.h"
 #include "dsmoe/training/adam.h"
 #include "dsmoe/vec.h"
@@ -100,6 +101,16 @@ template <class S> struct AddView {
     gradient_sum[i] += sqrt(x * x + y * y);
     view_count[i] += S(1);
   }
+};
+
+// How far from its centre a footprint is felt: by this a panorama has copies of those that cross its seam.
+template <class S> struct PixelReach {
+  const int32_t* radii;      // [N]
+  const S* opacities;        // [N]
+  const S* squared_reaches;  // [N]
+  S* reach;                  // [N] pixels, written
+
+  DSMOE_HD void operator()(int64_t i) const { reach[i] = pixel_reach(S(radii[i]), opacities[i], squared_reaches[i]); }
 };
 
 // One step of Adam on the background's gate lambda = bound + exp(p), and lambda anew. There is one i.
