@@ -65,6 +65,16 @@ def test_two_blends_share_a_picture(opened):
     assert np.abs(whole[left] - whole[right]).max() > 20
 
 
+def test_another_blend_has_its_own_faint_below(opened):
+    """That of the training is of its blend alone."""
+    camera, other = camera_of(opened), Blend("smoe", 0.0)
+    usual = picture(opened.renderer, camera, Look(other))
+    opened.renderer.faint_below = 0.0
+    assert np.array_equal(picture(opened.renderer, camera, Look(other)), usual)
+    opened.renderer.blend_by("smoe", 0.0)
+    assert not np.array_equal(picture(opened.renderer, camera, Look(other)), usual)
+
+
 @pytest.mark.parametrize("shown", SHOWN)
 @pytest.mark.parametrize("mode", BLEND_MODES)
 def test_everything_can_be_shown_in_every_mode(opened, mode, shown):
@@ -232,6 +242,13 @@ class Panel:
         return lambda *arguments, **options: SimpleNamespace(
             value=options.get("initial_value", arguments[1] if name == "add_number" else False), content="",
             on_update=lambda _: None)
+
+
+def test_a_gate_that_somebody_has_set_stays():
+    controls = server.Controls(Panel(), Blend("smoe", 0.03), lambda: None)
+    controls.gate.value = 0.7
+    controls.follow(Blend("smoe", 0.03), Blend("smoe", 0.5))
+    assert (controls.gate.value, controls.other_gate.value) == (0.7, 0.5)
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, 1e300, 0.5])
