@@ -67,6 +67,15 @@ def test_half_a_ring_of_tilted_photographs_has_its_up_and_is_turned_upright(up):
     assert upright(down, up) is down
 
 
+def test_photographs_that_all_look_one_way_do_not_say_what_is_level():
+    """Their horizontal axes run parallel, so it is the vertical one of the images, here 30 degrees off the world's."""
+    eye = np.array([0.0, -math.sin(math.pi / 6), -math.cos(math.pi / 6)])
+    rotation = look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    cameras = [dataclasses.replace(default_camera(), rotation=rotation, translation=-rotation @ (eye + [x, 0, 0]))
+               for x in (-1.0, 0.0, 1.0)]
+    assert np.allclose(orbit_of_cameras(cameras).up, -rotation[1])
+
+
 def test_photographs_of_both_formats_have_the_up_of_most():
     """A camera that is held upright has another one's vertical axis as its horizontal one."""
     up = np.array([0.0, 0.0, 1.0])
