@@ -12,7 +12,7 @@ from .bench.names import SCENES, SELECTORS, SHIPPED
 from .bench.names import VARIABLES as LPIPS_VARIABLES
 from .options import choices
 from .options.config import PRINCIPAL_POINTS, TrainConfig
-from .options.config_arguments import add_arguments, file_name, number, whole_number
+from .options.config_arguments import add_arguments, blend_mode, file_name, number, whole_number
 from .options.presets import BEST, FAST
 from .patches import TRAINERS
 
@@ -179,7 +179,7 @@ def build_parser() -> argparse.ArgumentParser:
                               usage="dsmoe run (--paper | --blend-mode MODE) [OPTION ...] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES,
+    run.add_argument("--blend-mode", "--blend_mode", type=blend_mode, choices=BLEND_MODES,
                      help="nothing records it: give the same where a trained model is rendered")
     _add_paper(run)
     run.add_argument("--faint-below", "--faint_below", type=number, metavar="X", help="as in train")
@@ -189,7 +189,8 @@ def build_parser() -> argparse.ArgumentParser:
                           "0 is the program of the paper's authors, not Eq. 7 of its text, which is smoe_eq7 with 0")
     run.add_argument("--trainer", metavar="NAME",
                      help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
-                          "(inria, inria_2024, scaffold, ...); default: found out from the script's folder")
+                          "(inria, inria_2024, scaffold, ...); list: print them all; default: found out "
+                          "from the script's folder")
     run.add_argument("words", metavar="COMMAND", nargs=argparse.REMAINDER, help="such as: python train.py -s DATA")
 
     bench = commands.add_parser("bench", help="compare blend modes and trainers over a suite of scenes",
@@ -249,7 +250,7 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
     parser.add_argument("--scene", type=file_name, help="folder " + scene)
-    parser.add_argument("--blend-mode", choices=BLEND_MODES,
+    parser.add_argument("--blend-mode", type=blend_mode, choices=BLEND_MODES,
                         help="of a file that does not record it (default: alpha); must agree where it does")
     parser.add_argument("--background-gate", type=number, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")

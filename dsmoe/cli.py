@@ -147,9 +147,12 @@ def _patch(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from .patches.run import run
+    from .patches.run import TRAINER_LIST, run
 
     words = arguments.words[1:] if arguments.words[:1] == ["--"] else arguments.words
+    if arguments.trainer == "list":
+        print(TRAINER_LIST)
+        return
     if not arguments.blend_mode:
         arguments.command_parser.error("--blend-mode MODE or --paper is needed")
     run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate, arguments.faint_below)

@@ -139,6 +139,8 @@ def blend_of_process() -> Optional[Record]:
         mode, background_gate = gate.blend_mode, settings.LEARNED
     if not mode:
         return None
+    if mode == settings.PAPER:  # of the variable, before the trainer's options are read
+        return Record(**settings.PAPER_PROGRAM)  # type: ignore[arg-type]
     mode = settings.resolve_blend_mode(mode)
     if mode not in settings.GATED_MODES:
         return Record(mode)

@@ -123,7 +123,7 @@ class Patched:
 
 def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
     """Plans the patch of a checkout in whatever state it is."""
-    root, now = Path(path), _files(Path(path))
+    root, now = Path(path), _files(path)
     before = {name: unpatched(data) for name, data in now.items()}
     applied = [name for name in OPTIONS if any(f"{name}.start()  {MARK}".encode() in data for data in now.values())]
     found = facts.of_checkout(before)
@@ -192,8 +192,8 @@ def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
         return (f"neither a patch nor `dsmoe run` can stand in for that; an import of {INTEGRATIONS} in its code can: "
                 "integrations/README.md lists their APIs")
     by_run = _by_run(files).replace("smoe --", "smoe --trainer NAME --")
-    return (f"no patch fits; {by_run}. NAME is the rasterizer whose API it calls (`list` prints all), or "
-            "the order of its results, such as color,depth,radii")
+    return (f"no patch fits; {by_run}. NAME is the rasterizer whose API it calls (`dsmoe run --trainer list` prints "
+            "all), or the order of its results, such as color,depth,radii")
 
 
 def _script_of(files: Mapping[str, bytes]) -> str:
@@ -267,7 +267,7 @@ def revert(path: PathLike) -> List[str]:
 
     Raises PatchError, and touches nothing, if a file has no patch that can be taken out.
     """
-    root, now = Path(path), _files(Path(path))
+    root, now = Path(path), _files(path)
     before = {name: unpatched(data) for name, data in now.items()}
     back = {name: data for name, data in before.items() if data != now[name]}
     for name, data in before.items():
@@ -286,8 +286,11 @@ def revert(path: PathLike) -> List[str]:
     return list(back)
 
 
-def _files(root: Path) -> Dict[str, bytes]:
+def _files(path: PathLike) -> Dict[str, bytes]:
     """Returns the Python files of a checkout, and how its submodules are built."""
+    root = Path(path)
+    if not str(path):  # pathlib takes it for the current folder, as a variable that is unset would have it patched
+        raise PatchError("the path is empty; name the checkout's folder, `.` for the current one")
     if not root.is_dir():
         raise PatchError(f"{root}: is not a folder; wanted is the checkout's, in which train.py or compress.py lies")
     paths = [*root.glob("submodules/*/setup.py"), *root.glob("submodules/*/backend.py")]

@@ -36,6 +36,8 @@ AS_RASTERIZER = "from dsmoe.patches import runtime\nglobals().update(runtime.ras
 AS_NOTHING = "raise ImportError('dsmoe run: {0} computes something else; this package cannot stand in for it')\n"
 AS_GSPLAT = "from dsmoe.patches import runtime\nruntime.gsplat_of_run()\n"
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
+TRAINER_LIST = (f"trainers: {', '.join(TRAINER_NAMES)}\nrasterizers, for other trainers that call their API: "
+                f"{', '.join(FLAVOURS)}\nor what a call returns, such as color,depth,median_depth,alpha,radii")
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
@@ -195,7 +197,7 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
     nearest = dict.fromkeys([next(iter(files)), Path.cwd()])
     below = [f"{folder}: {hint}" for folder in nearest for hint in facts.below(folder)]
     raise PatchError("no trainer that is known was found; --trainer names it, or the rasterizer whose API it calls "
-                     "(--trainer list prints the names):\n  " + "\n  ".join(
+                     "(`dsmoe run --trainer list` prints the names):\n  " + "\n  ".join(
                          [*reasons, *below] or [f"there is no {GR} in {', '.join(map(str, files))}"]))
 
 

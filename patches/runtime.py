@@ -49,7 +49,8 @@ def default_blend() -> Tuple[str, str]:
     keep_records()
     _explain_no_gpu()
     _check_renderer()  # if only it was restored, the option would be recorded and ignored
-    return resolve_blend_mode(None), ""
+    is_paper = os.environ.get(BLEND_MODE_VARIABLE) == PAPER
+    return PAPER if is_paper else resolve_blend_mode(None), ""
 
 
 def default_smoe() -> Tuple[str, str]:
@@ -107,7 +108,7 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
     _check_renderer()
     mode, gate, faint = (getattr(dataset, option, None) for option in OPTIONS)  # a gate that is typed is a string
     if mode == PAPER:
-        if gate not in ("", None) and gate != "0" and gate != 0:
+        if gate not in ("", None) and settings.training_background_gate("smoe", gate) != 0:
             raise ValueError(f"the background gate is {gate!r}; with the blend mode {PAPER} it is 0, or left out")
         mode, gate, faint = PAPER_PROGRAM.values()
     saved = _saved(dataset)

@@ -2,10 +2,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Sequence, Tuple, Union
 
-from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, PAPER_PROGRAM
+from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, PAPER, PAPER_PROGRAM
 
 from ..errors import ConfigError
 from .config import KINDS, LEARNED, TrainConfig, flags_of, learned_gate_of
@@ -49,6 +50,13 @@ def file_name(text: str) -> str:
     return text
 
 
+def blend_mode(text: str) -> str:
+    """What was typed. Raises ArgumentTypeError if it is the word that patched trainers have for --paper."""
+    if text == PAPER:
+        raise argparse.ArgumentTypeError(f"{PAPER} is no blend mode here; for the paper's program type --paper")
+    return text
+
+
 def _number_or_learned(text: str) -> Union[float, str]:
     return text if text == LEARNED else _typed(float, text, f"{KINDS[float]} or `{LEARNED}`")
 
@@ -77,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         if option.type == "bool":
             group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue
-        kind = _TYPES[str(option.type)]
+        kind = blend_mode if option.name == "blend_mode" else _TYPES[str(option.type)]
         keywords: Dict[str, Any] = {"type": kind, "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True
@@ -92,11 +100,18 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
     return groups
 
 
+def is_same(given: Any, value: Any) -> bool:
+    """Whether what was typed, a word or a number, is this value: `0` is 0.0."""
+    with contextlib.suppress(TypeError, ValueError):
+        return float(given) == value
+    return str(given) == str(value)
+
+
 def take_paper(arguments: argparse.Namespace) -> None:
     """Sets the options that --paper stands for, where it is given. Raises ConfigError if one of them is another."""
     for name, value in PAPER_PROGRAM.items() if getattr(arguments, "paper", False) else ():
         given = getattr(arguments, name, None)
-        if given not in (None, value) and str(given) != str(value):
+        if given not in (None, value) and not is_same(given, value):
             raise ConfigError(f"--{name.replace('_', '-')} is {given!r}; with --paper it is {value!r}, or left out")
         setattr(arguments, name, value)
 

@@ -113,6 +113,17 @@ def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
         patches.apply(tmp_path / "nowhere")
 
 
+def test_an_empty_path_is_not_the_current_folder(tmp_path, monkeypatch, dsmoe):
+    """As of a variable that is unset: `dsmoe patch apply "$TRAINER"`."""
+    monkeypatch.chdir(make(tmp_path))
+    for call in (patches.apply, patches.check, patches.diff, patches.revert):
+        with pytest.raises(patches.PatchError, match="the path is empty; name the checkout's folder"):
+            call("")
+        said = dsmoe("patch", call.__name__, "")
+        assert said.status == 2 and "is empty" in said.err
+    assert patches.check(".").state == "patchable"
+
+
 class Killed(BaseException):
     """Nothing of the program runs after it."""
 

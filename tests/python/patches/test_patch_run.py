@@ -151,8 +151,9 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({}, [*RUN, "--"], "there is no command"), ({}, ["run", "--blend_mode", "smoe", "--"], "there is no command"),
     ({}, [*RUN, "--", "no-such-command"], "no-such-command: No such file"),
     ({"tool.py": ""}, [*RUN, "--", "./tool.py"], "./tool.py: Permission denied"),
-    ({GR: None}, PYTHON, f"--trainer list prints the names):\n  there is no {GR} in"),
-    ({}, [*RUN, "--trainer", "list", "--", sys.executable], "absgs, c3dgs, cob_gs"),
+    ({GR: None}, PYTHON, f"--trainer list` prints the names):\n  there is no {GR} in"),
+    ({}, ["run", "--blend-mode", "paper", "--", "x"], "for the paper's program type --paper"),
+    ({}, ["train", "x", "-o", "o", "--blend-mode", "paper"], "for the paper's program type --paper"),
     ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3d-smoe"),
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
@@ -171,6 +172,20 @@ def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_pa
     monkeypatch.chdir(make(tmp_path, files))
     result = dsmoe(*words)
     assert result.status in (1, 2) and said in result.err and "Traceback" not in result.err
+
+
+@pytest.mark.parametrize("words", [[], RUN[1:], ["--paper", "--", "python"]])
+def test_the_names_of_trainers_are_printed(words, dsmoe):
+    said = dsmoe("run", "--trainer", "list", *words)
+    assert said.status == 0 and said.err == ""
+    names = said.out.replace(",", " ").split()
+    assert {*patches.TRAINERS, *(contract.name for contract in CONTRACTS)} <= set(names)
+
+
+@pytest.mark.parametrize("gate", ["0", "0.0"])
+def test_paper_takes_the_gate_that_it_stands_for(gate, dsmoe):
+    assert "there is no command" in dsmoe("run", "--paper", "--background-gate", gate).err
+    assert "with --paper it is 0.0, or left out" in dsmoe("run", "--paper", "--background-gate", gate + "1").err
 
 
 CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs

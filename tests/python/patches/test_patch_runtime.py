@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings, settings
+from diff_smoe_rasterization.integrations import records
 from diff_smoe_rasterization.settings import GATED_MODES, resolve_blend
 from dsmoe.patches import runtime
 from dsmoe.system import device
@@ -45,6 +46,10 @@ def test_the_default_is_alpha_or_the_variable(monkeypatch):
     assert runtime.default_blend() == ("alpha", "")
     monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe_tn")
     assert runtime.default_blend() == ("smoe_tn", "")
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "paper")
+    assert records.blend_of_process()[:3] == tuple(AUTHORS.values()), "a file that is read before the options"
+    for default, blend in ((runtime.default_blend, runtime.blend_of), (runtime.default_smoe, runtime.smoe_of)):
+        assert blend(run(*default())) == AUTHORS
     monkeypatch.setenv("DSMOE_BLEND_MODE", "smo")
     with pytest.raises(ValueError, match="DSMOE_BLEND_MODE is 'smo'.*alpha, smoe, smoe_eq7, smoe_tn, smoe_std"):
         runtime.default_blend()
@@ -114,6 +119,8 @@ def test_the_papers_program_is_a_word_for_three_settings(tmp_path, monkeypatch):
     monkeypatch.setenv("DSMOE_FAINT_BELOW", "0.9")
     assert runtime.blend_of(run("smoe", "0"))["faint_below"] == settings.resolve_faint_below("smoe", None) == 0.9
     assert runtime.blend_of(run("alpha")) == ALPHA
+    for zero in ("0", "0.0", 0, None):
+        assert runtime.blend_of(run("paper", zero)) == AUTHORS
     with pytest.raises(ValueError, match="gate is '0.5'; with the blend mode paper it is 0, or left out"):
         runtime.blend_of(run("paper", "0.5"))
 
