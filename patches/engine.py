@@ -32,6 +32,7 @@ CALLS = r"|\b(?:chosen_blend|default_(?:blend|smoe)|(?:saved_)?(?:blend|smoe)_of
 TO_COMPILE = {"_gridencoder", "arithmetic", "tinycudann"}  # PyPI has none of them, or another's of that name
 PIP_NAMES = {"cv2": "opencv-python-headless", "PIL": "pillow", "skimage": "scikit-image", "sklearn": "scikit-learn",
              "yaml": "pyyaml"}  # of packages that are installed by another name
+TRAINS, IS_SCRIPT = re.compile(rb"(?m)^def training\("), re.compile(rb"(?m)^if __name__ *==.*__main__")
 PathLike = Union[str, Path]
 
 
@@ -170,7 +171,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
              for name, data in now.items() if data != as_it_was[name]]
     state, reasons = (("unpatchable" if now == before else "drifted", patched.problems) if patched.problems else
                       ("patched", []) if not wrong else ("patchable", []) if now == before else ("half-patched", wrong))
-    if state == "unpatchable":
+    if state == "unpatchable" and _can_start(before):
         reasons = [*reasons, f"unpatched it may run: {_by_run(before)}"]
     patched.notes += facts.of_one_name(root)
     patched.notes += [f"warning: {blends}"] * bool(blends)
@@ -197,14 +198,23 @@ def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
 
 
 def _script_of(files: Mapping[str, bytes]) -> str:
-    trains = [name for name, data in files.items() if b"def training(" in data and b"__main__" in data]
-    trains = trains or _training_scripts(files) or ["train.py"]
-    return min(trains, key=lambda name: (name.count("/"), name != "train.py", name))
+    trains = [name for name, data in files.items() if TRAINS.search(data) and IS_SCRIPT.search(data)]
+    trains = trains or _training_scripts(files) or ["train.py" if "train.py" in files else "SCRIPT"]
+    return min(trains, key=lambda name: (name.count("/"), name != "train.py", not name.startswith("train"), name))
 
 
 def _training_scripts(files: Mapping[str, bytes]) -> List[str]:
-    """Scripts that say by their name that they train."""
-    return [name for name, data in files.items() if "train" in name.rpartition("/")[2] and b"__main__" in data]
+    """Scripts that say by their name that they train; tests of a training do not."""
+    return [name for name, data in files.items() if "train" in name.rpartition("/")[2] and IS_SCRIPT.search(data)
+            and not {"test", "tests"} & set(name.split("/")) and not name.rpartition("/")[2].startswith("test_")]
+
+
+def _can_start(files: Mapping[str, bytes]) -> bool:
+    """Whether the script that trains is there, and it and what it imports can be parsed."""
+    loaded = facts.reached(files, [_script_of(files)])
+    with contextlib.suppress(PatchError):
+        return bool([tree_of(data) for data in loaded.values()])
+    return False
 
 
 def _by_run(files: Mapping[str, bytes]) -> str:
@@ -216,7 +226,7 @@ def _runs(root: Path, files: Mapping[str, bytes]) -> bool:
     """Whether `dsmoe run` takes what `_by_run` says."""
     with contextlib.suppress(PatchError):
         run.prepare(["python", str(root / _script_of(files))], "smoe", None, {})
-        return True
+        return _script_of(files) in files
     return False
 
 

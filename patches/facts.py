@@ -379,11 +379,11 @@ def is_for_sparse_adam(root: Path, files: Mapping[str, bytes], facts: Set[str]) 
                    for path in root.glob(f"submodules/*/{RASTERIZER}/__init__.py")))
 
 
-def below(root: Path) -> List[str]:
-    """Says which folders of a folder are checkouts, if it is none."""
+def below(root: Path, remedy: str = "name") -> List[str]:
+    """Says which folders of a folder are checkouts, if it is none. remedy: what to do with one of them."""
     if (root / GR).is_file():
         return []
     found = sorted({path.parent.parent.relative_to(root).as_posix() for pattern in ("*/", "*/*/")
                     for path in root.glob(pattern + GR)})
-    return [f"there is no {GR} in it, but in {', '.join(found[:3])}{' and others' * (len(found) > 3)}: name "
-            f"{'that folder' if len(found) == 1 else 'one of these'}, or a script in it"] if found else []
+    return [f"there is no {GR} in it, but in {', '.join(found[:3])}{' and others' * (len(found) > 3)}: {remedy} "
+            f"{'that folder' if len(found) == 1 else 'one of these'}"] if found else []

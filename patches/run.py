@@ -35,6 +35,7 @@ PACKAGES = "DSMOE_RUN_PACKAGES"  # PACKAGE=FLAVOUR of what the trainer imports; 
 AS_RASTERIZER = "from dsmoe.patches import runtime\nglobals().update(runtime.rasterizer_of_run({0!r}))\n"
 AS_NOTHING = "raise ImportError('dsmoe run: {0} computes something else; this package cannot stand in for it')\n"
 AS_GSPLAT = "from dsmoe.patches import runtime\nruntime.gsplat_of_run()\n"
+TO_FOLDER = "change into"  # the remedy where the trainer is in a folder below
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 TRAINER_LIST = (f"trainers: {', '.join(TRAINER_NAMES)}\nrasterizers, for other trainers that call their API: "
                 f"{', '.join(FLAVOURS)}\nor what a call returns, such as color,depth,median_depth,alpha,radii")
@@ -82,6 +83,11 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         raise PatchError(str(error)) from None
     if not words:
         raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
+    missing = _missing_script(words)
+    if missing:
+        below = facts.below(Path.cwd(), TO_FOLDER) or [f"{TO_FOLDER} the trainer's folder"]
+        raise PatchError(f"{missing}: there is no such script in {Path.cwd()}; {below[0]}, or name the script with its "
+                         "folder")
     script = _script(words)
     folders = _folders(script)
     files = {folder: _read(folder, everywhere=folder == folders[0]) for folder in folders}
@@ -195,7 +201,7 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
         return by_name[trainer], trainer, reasons or [f"no file that imports {module} was found"] * (
             not everything), everything
     nearest = dict.fromkeys([next(iter(files)), Path.cwd()])
-    below = [f"{folder}: {hint}" for folder in nearest for hint in facts.below(folder)]
+    below = [f"{folder}: {hint}" for folder in nearest for hint in facts.below(folder, TO_FOLDER)]
     raise PatchError("no trainer that is known was found; --trainer names it, or the rasterizer whose API it calls "
                      "(`dsmoe run --trainer list` prints the names):\n  " + "\n  ".join(
                          [*reasons, *below] or [f"there is no {GR} in {', '.join(map(str, files))}"]))
@@ -217,6 +223,14 @@ def _script(words: Sequence[str]) -> Optional[Path]:
     modules = [after.replace(".", "/") + ".py" for word, after in zip(words, words[1:]) if word == "-m"]
     return next((Path(word).resolve() for word in [*words, *modules]
                  if word.endswith(".py") and Path(word).is_file()), None)
+
+
+def _missing_script(words: Sequence[str]) -> str:
+    """Returns the script that a command of Python names and that is not there, else ""."""
+    first = next((number for number, word in enumerate(words) if number and not word.startswith("-")), 0)
+    is_script = re.fullmatch(r"python[\d.]*", Path(words[0]).name) and words[first].endswith(".py") and (
+        words[first - 1] not in ("-c", "-m"))
+    return words[first] if is_script and not Path(words[first]).exists() else ""
 
 
 def _folders(script: Optional[Path]) -> List[Path]:

@@ -109,8 +109,11 @@ def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
     refused(make(tmp_path / "checkout"), "no trainer 'x'", *patches.TRAINERS, trainer="x")
     refused(tmp_path / "checkout", "hac", trainer="hac")
     refused(tmp_path / "checkout/arguments", f"there is no {GR} in it")
+    refused(tmp_path, "in broken, checkout, missing", "and others: name one of these")
     with pytest.raises(patches.PatchError, match="not a folder"):
         patches.apply(tmp_path / "nowhere")
+    for broken in ("missing", "broken"):
+        assert not any("dsmoe run" in line for line in patches.check(tmp_path / broken).reasons)
 
 
 def test_an_empty_path_is_not_the_current_folder(tmp_path, monkeypatch, dsmoe):
@@ -500,6 +503,12 @@ def test_the_script_that_trains_is_named(tmp_path, dsmoe):
     (tmp_path / "examples/simple_trainer.py").write_text(script)
     inside = dsmoe("patch", "check", tmp_path / "examples")
     assert inside.status == 0 and "`dsmoe run --blend-mode smoe -- python simple_trainer.py ...` in it" in inside.out
+    (tmp_path / "examples/simple_trainer.py").rename(tmp_path / "examples/distill_train.py")
+    (tmp_path / "examples/train_prune.py").write_text(script)
+    assert "python train_prune.py ..." in dsmoe("patch", "check", tmp_path / "examples").out
+    (tmp_path / "tests").mkdir()
+    for name in ("tests/train.py", "test_train.py"):
+        (tmp_path / name).write_text(script)
     (tmp_path / "own.py").write_text("from diff_surfel_rasterization import GaussianRasterizer\n")
     above = dsmoe("patch", "check", tmp_path)
     assert above.status == 1 and "name the folder of the script that you run, such as examples\n" in above.out

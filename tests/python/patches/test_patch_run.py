@@ -125,7 +125,7 @@ def test_stand_ins_only_for_what_is_missing(tmp_path, python):
 @pytest.mark.parametrize("mode", BLEND_MODES)
 def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
     """That which is asked for, else the variable's, else the mode's; and none in modes that know none."""
-    words = [sys.executable, "show.py"]
+    words = [sys.executable, "-c", "a.py"]
     own = "learned" if mode == "smoe" else 0.0
     for variable, asked, gate in (("", None, own), ("0.25", None, 0.25), ("0.25", 0.0, 0.0),
                                  ("0.25", "learned", "learned")):
@@ -154,6 +154,8 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({GR: None}, PYTHON, f"--trainer list` prints the names):\n  there is no {GR} in"),
     ({}, ["run", "--blend-mode", "paper", "--", "x"], "for the paper's program type --paper"),
     ({}, ["train", "x", "-o", "o", "--blend-mode", "paper"], "for the paper's program type --paper"),
+    ({GR: None}, ["run", "--paper", "--", sys.executable, "-u", "trian.py"], "trian.py: there is no such script in"),
+    ({GR: None, "x/" + GR: ""}, [*RUN, "--", sys.executable], "in x: change into that folder"),
     ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3d-smoe"),
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
@@ -442,7 +444,7 @@ def test_the_script_that_is_run_says_which_renderer_counts(like_3dgs, tmp_path, 
 def test_a_folder_of_checkouts_is_told_which_they_are(tmp_path, monkeypatch):
     make(tmp_path / "one", {GR: GOF})
     monkeypatch.chdir(make(tmp_path, {GR: None, "train.py": None}))
-    with pytest.raises(patches.PatchError, match="but in one: name that folder"):
+    with pytest.raises(patches.PatchError, match="but in one: change into that folder"):
         run.prepare([sys.executable, "x.py"], "smoe", None, environment())
     make(tmp_path / "deep/two")
     refused(tmp_path, f"there is no {GR} in it, but in deep/two, one: name one of these")
