@@ -33,6 +33,7 @@ TO_COMPILE = {"_gridencoder", "arithmetic", "tinycudann"}  # PyPI has none of th
 PIP_NAMES = {"cv2": "opencv-python-headless", "PIL": "pillow", "skimage": "scikit-image", "sklearn": "scikit-learn",
              "yaml": "pyyaml"}  # of packages that are installed by another name
 TRAINS, IS_SCRIPT = re.compile(rb"(?m)^def training\("), re.compile(rb"(?m)^if __name__ *==.*__main__")
+OWN = "it is this package's own, and no trainer's; name the folder in which a trainer's train.py lies"
 PathLike = Union[str, Path]
 
 
@@ -139,7 +140,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     renamed = facts.those(found, "renamed ")
     others = facts.those(found, "from ") - {RASTERIZER} or facts.those(found, "defines ") or renamed
     callers = facts.importers(before)
-    below = facts.below(root)
+    is_own = GR not in now and (root / "dsmoe/cli.py").is_file()
+    below = [OWN] if is_own else facts.below(root)
     if below:
         reason, chosen = below[0], None
     elif known and facts.blocked(found):
@@ -149,7 +151,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         by = f" ({', '.join(sorted(renamed))})" if renamed else ""
         reason = reason or f"its rasterizer is {chosen.flavour}{by}, for which there is no patch: {_by_run(before)}"
         chosen = None
-    elif callers and GR not in callers and known:
+    elif callers and GR not in callers and known and _has_script(before):
         reason = (f"{GR} {'does not import' if GR in now else 'is not there to import'} the rasterizer, but "
                   f"{', '.join(callers[:3])}, and a patch is only of {GR}: {_by_run(before)}")
         chosen = None
@@ -186,7 +188,7 @@ def _instead(files: Mapping[str, bytes], found: Set[str]) -> str:
     scripts = _training_scripts(files)
     if scripts and all("/" in name for name in scripts):
         return f"name the folder of the script that you run, such as {scripts[0].rpartition('/')[0]}"
-    if not facts.calls_some(found) and not facts.importers(files):
+    if not _has_script(files) or not facts.calls_some(found) and not facts.importers(files):
         return ("name the folder in which train.py lies; a script of any other folder is run by "
                 "`dsmoe run --blend-mode smoe -- python SCRIPT ...`")
     if facts.those(found, "uses ") or "from " + facts.OF_GSPLAT in found:
@@ -207,6 +209,11 @@ def _training_scripts(files: Mapping[str, bytes]) -> List[str]:
     """Scripts that say by their name that they train; tests of a training do not."""
     return [name for name, data in files.items() if "train" in name.rpartition("/")[2] and IS_SCRIPT.search(data)
             and not {"test", "tests"} & set(name.split("/")) and not name.rpartition("/")[2].startswith("test_")]
+
+
+def _has_script(files: Mapping[str, bytes]) -> bool:
+    """Whether something may be run in a folder; in one of a checkout's modules there is nothing."""
+    return "train.py" in files or any(map(IS_SCRIPT.search, files.values()))
 
 
 def _can_start(files: Mapping[str, bytes]) -> bool:

@@ -108,7 +108,9 @@ def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
             "name the folder in which train.py lies")
     refused(make(tmp_path / "checkout"), "no trainer 'x'", *patches.TRAINERS, trainer="x")
     refused(tmp_path / "checkout", "hac", trainer="hac")
-    refused(tmp_path / "checkout/arguments", f"there is no {GR} in it")
+    refused(tmp_path / "checkout/gaussian_renderer", f"there is no {GR} in it", "the folder in which train.py lies")
+    refused(make(tmp_path / "own", {**dict.fromkeys(CHECKOUT), "dsmoe/cli.py": "", "tests/train.py": TRAIN}),
+            "this package's own, and no trainer's; name the folder")
     refused(tmp_path, "in broken, checkout, missing", "and others: name one of these")
     with pytest.raises(patches.PatchError, match="not a folder"):
         patches.apply(tmp_path / "nowhere")
