@@ -66,9 +66,15 @@ def test_two_runs_are_shown_beside_the_photograph_of_a_view(output, tiny_scene, 
         wanted = np.asarray(expected.resize(picture.size, Image.LANCZOS), np.float64)
         differs = np.abs(np.asarray(picture, np.float64) - wanted).mean(axis=(1, 2))
     assert picture.width == 300 and not differs[len(differs) // 10:].any(), "below the labels, which have other words"
-    with pytest.raises(SystemExit):
-        compare_runs.main([*runs, "-o", str(tmp_path / "b.png"), "--view", "view_001.png"])
-    assert "--view view_001.png: the test views are view_000.png, view_008.png" in capsys.readouterr().err
+    for given, told in (([*runs, "-o", "b.png", "--view", "view_001.png"],
+                         "--view view_001.png: the test views are view_000.png, view_008.png"),
+                        ([str(tmp_path / "nowhere"), runs[0], "-o", "b.png"], str(tmp_path / "nowhere")),
+                        ([*runs, "-o", "p.xyz"], "-o p.xyz: no picture ends in .xyz; name a .png or .jpg"),
+                        ([*runs, "-o", str(tmp_path / "a.png" / "b.png")], "a.png is no folder"),
+                        ([*runs, "-o", "b.png", "--width", "0"], "--width is 0; it must be at least 1")):
+        assert compare_runs.main(given) == 1
+        text = capsys.readouterr().err
+        assert told in text and text.count("\n") == 1
 
 
 def test_the_table_and_a_second_run(tiny_scene, output, capsys):
