@@ -8,16 +8,20 @@ Gaussians. It renders on the CPU.
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from typing import Optional, Sequence
 
 import torch
 from PIL import Image
 
+from dsmoe.errors import TrainerError, in_one_line
 from dsmoe.inspection import open_run, to_image
 from dsmoe.options.config import TrainConfig
 from dsmoe.results.metrics import psnr, quantised
 from dsmoe.results.pictures import comparison
 from dsmoe.scenes.scene import load_scene
+from dsmoe.system.files import check_place
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("runs", nargs="+", metavar="OUT")
@@ -27,15 +31,31 @@ parser.add_argument("--scene", help="folder of the scene (default: the first run
 parser.add_argument("--width", type=int, default=1200, help="of the picture, pixels (default: 1200)")
 
 
-def main(argv: Optional[Sequence[str]] = None) -> None:
-    arguments = parser.parse_args(argv)
+def main(argv: Optional[Sequence[str]] = None) -> int:
+    try:
+        compare(parser.parse_args(argv))
+    except Exception as error:
+        text = in_one_line(error)
+        if text is None:
+            raise
+        print(f"{parser.prog}: error: {text}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def compare(arguments: argparse.Namespace) -> None:
+    check_picture(arguments.output)
+    if arguments.width < 1:
+        raise TrainerError(f"--width is {arguments.width}; it must be at least 1")
     options = {"scene": arguments.scene} if arguments.scene else {}
     configs = [TrainConfig.of_run(run, "--scene", device="cpu", **options) for run in arguments.runs]
     views = load_scene(configs[0], progress=False).test
+    if not views:
+        raise TrainerError(f"{arguments.runs[0]}: no test view; --test-every keeps some")
     names = [view.camera.name for view in views]
     name = arguments.view or names[0]
     if name not in names:
-        parser.error(f"--view {name}: the test views are {', '.join(names)}")
+        raise TrainerError(f"--view {name}: the test views are {', '.join(names)}")
     view = views[names.index(name)]
     truth = view.image_float()
     labelled = []
@@ -50,5 +70,13 @@ def main(argv: Optional[Sequence[str]] = None) -> None:
     sheet.resize((arguments.width, height), Image.LANCZOS).save(arguments.output, quality=85)
 
 
+def check_picture(path: str) -> None:
+    """Raises TrainerError if no picture can be written there, by its ending or its folder."""
+    ending = os.path.splitext(path)[1].lower()
+    if Image.registered_extensions().get(ending) not in Image.SAVE:
+        raise TrainerError(f"-o {path}: no picture ends in {ending or 'nothing'}; name a .png or .jpg")
+    check_place(path, is_one_file=True)
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

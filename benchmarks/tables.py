@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import statistics
 from pathlib import Path
 from typing import Any, Callable, Dict, Iterable, List, Optional, Sequence, Tuple
@@ -693,10 +694,14 @@ def points_of_bonsai() -> Dict[Tuple[str, str], List[Tuple[float, float]]]:
     return {series: sorted(points) for series, points in found.items()}
 
 
-def main() -> None:
+def main(argv: Optional[Sequence[str]] = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--figure", metavar="PNG", help="draw it here")
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
+    if options.figure and not os.access(Path(options.figure).resolve().parent, os.W_OK):
+        parser.error(f"--figure {options.figure}: its folder is not there, or must not be written in")
+    if options.figure and Path(options.figure).suffix.lower() != ".png":
+        parser.error(f"--figure {options.figure}: name a .png")
     for text in (*(text for texts in tables().values() for text in texts),
                  *(f"{page}: {text}" for page, texts in sentences().items() for text in texts)):
         print(text, end="\n\n")

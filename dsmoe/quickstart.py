@@ -5,7 +5,6 @@ python -m dsmoe.quickstart [SCENE] [--iterations N] [--resolution R] [-o OUT]
 from __future__ import annotations
 
 import argparse
-import itertools
 import os
 import shlex
 import shutil
@@ -14,11 +13,20 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from .errors import TrainerError, in_one_line, print_any_name
+from .errors import in_one_line, print_any_name
 from .inspection import open_renderer, to_image
 from .options.config import IMAGES, TrainConfig, flags_text
 from .options.presets import FAST, STRATEGY, chosen_for_scene, with_preset
-from .options.quickstart_options import DEFAULT_FOLDER, MODES, config_of, given_options, parse, unchecked_config
+from .options.quickstart_options import (
+    MODES,
+    PROGRAM,
+    config_of,
+    earlier_files,
+    given_options,
+    output_and_subject,
+    parse,
+    unchecked_config,
+)
 from .options.short_run import smaller_images
 from .results.metrics import psnr, quantised
 from .results.modelfile import model_path
@@ -29,14 +37,11 @@ from .scenes.scene import Scene, load_scene, read_layout
 from .scenes.synthetic import write_synthetic_scene
 from .system.device import chosen_device, device_line
 from .system.interrupt import exit_status
-from .system.output_folder import Record, make_folder, only_one, own_record, read_record, remove_files, write_record
+from .system.output_folder import Record, make_folder, only_one, remove_files, write_record
 from .system.process import command, set_up_process
 from .train import train
 
 PICTURES = 3  # test views that are shown
-PROGRAM = "quickstart"  # in its folder's record
-MADE_UP = "the one that it makes itself"
-MADE_UP_NAME = "room"
 # On a GPU the scene that it makes is larger too.
 MADE_UP_ON_GPU = {"views": 64, "width": 480, "height": 360, "points": 30_000}
 
@@ -66,12 +71,11 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     given["device"] = chosen_device(given.get("device"))
     print(device_line(given["device"]), flush=True)
     config = choose_options(arguments.scene, given) if arguments.scene else None
-    subject = os.path.abspath(arguments.scene) if arguments.scene else MADE_UP
-    output = arguments.output or default_output(subject)
-    _earlier_files(output, subject)
+    output, subject = output_and_subject(arguments)
+    earlier_files(output, subject, arguments.overwrite)
     make_folder(output)  # a folder that cannot be made is told before images are read
     with only_one(output):
-        earlier = _earlier_files(output, subject)  # again: another run may have been at work there
+        earlier = earlier_files(output, subject, arguments.overwrite)  # again: another run may have been at work there
         if config is None:
             folder = os.path.join(output, "scene")
             print(f"making a scene in {folder}: a room, ray-traced", flush=True)
@@ -103,26 +107,6 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     print(f"for photographs of yours: {command()} scene PHOTOS -o SCENE, which ends with the command that trains")
     print(f"to look at it in a browser: {command()} export {shlex.quote(os.path.join(output, MODES[1]))} -o model.html")
     return rows
-
-
-def default_output(subject: str) -> str:
-    """The folder for a scene if none is named: by its name, with a number if that is another scene's."""
-    name = MADE_UP_NAME if subject == MADE_UP else os.path.basename(subject)
-    for number in itertools.count(1):
-        folder = os.path.join(DEFAULT_FOLDER, name if number == 1 else f"{name}_{number}")
-        record = read_record(folder, PROGRAM)
-        if record is None or record.subject in ("", subject):
-            break
-    return folder
-
-
-def _earlier_files(output: str, subject: str) -> List[str]:
-    """What an earlier comparison on the same scene has written. Raises TrainerError if `output` holds another's."""
-    record = own_record(output, PROGRAM, folders=("scene", *MODES))
-    if record.subject not in ("", subject):
-        raise TrainerError(f"{output} holds the models and pictures of another scene, {record.subject}; choose another "
-                           "folder with -o, or remove it")
-    return record.files
 
 
 def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:

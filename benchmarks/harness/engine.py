@@ -77,11 +77,14 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     absent = what_is_missing(to_do)
     if dry_run:
         print(plan(cells, done, [*left_out, *absent]))
-        return []
-    print(*left_out, sep="\n", end="\n" * bool(left_out))
+    else:
+        print(*left_out, sep="\n", end="\n" * bool(left_out))
     if absent:
-        more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
+        where = "listed above" if dry_run else "--dry-run names them"
+        more = f" ({len(absent) - 1} more: {where})" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
+    if dry_run:
+        return []
     if to_do and slurm is None:
         from ..system.device import device_line  # it loads torch, which a suite does without
 

@@ -6,11 +6,13 @@ import os
 
 from ..errors import ConfigError, SceneError, TrainerError
 from ..system.files import check_output, check_place, is_file, is_folder
-from ..system.process import typed
+from ..system.process import command, typed
 from .choices import MODEL, ORBIT_FRAMES, VIDEO_FPS
 from .config import TrainConfig, holds_run
 from .config_arguments import given_options
 
+# One of these is in a scene's folder: a COLMAP model, or a file of cameras; the last is a trained model's.
+SPARSE, TRANSFORMS, NERF_SYNTHETIC, CAMERAS = "sparse", "transforms.json", "transforms_train.json", "cameras.json"
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 FILMED = (".mp4", ".gif", ".webp")  # what an orbit can be written as
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # nor is that a folder's name
@@ -89,11 +91,16 @@ def check_model(source: str) -> None:
         raise TrainerError(f"{source}: no such file or folder; name {MODEL}")
 
 
-def check_scene(folder: str) -> None:
-    """Raises SceneError if it is not a folder."""
+def check_scene(folder: str, program: str = "") -> None:
+    """Raises SceneError if it is not a folder of a scene. program: what is typed for `dsmoe`, else `command()`."""
     if not is_folder(folder):
         is_one = "is a file; a scene is a folder" if is_file(folder) else "no such folder"
         raise SceneError(f"scene {folder}: {is_one}")
+    if not is_folder(os.path.join(folder, SPARSE)) and not any(
+            is_file(os.path.join(folder, name)) for name in (TRANSFORMS, NERF_SYNTHETIC, CAMERAS)):
+        raise SceneError(f"scene {folder}: neither a folder `{SPARSE}` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
+                         f"instant-ngp, Polycam) nor {NERF_SYNTHETIC} (NeRF-synthetic) is in it. Of photographs "
+                         f"`{program or command()} scene PHOTOS -o SCENE` makes a scene")
 
 
 def check_photos(photos: str) -> None:

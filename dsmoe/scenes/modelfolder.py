@@ -16,13 +16,13 @@ import torch
 
 from ..errors import SceneError
 from ..options.config import TrainConfig
+from ..options.early import CAMERAS
 from ..system.files import is_file
 from .cameras import Camera
 from .images import View, fitted_camera, shown_by_lens, size_of_image
 from .layout import Layout, PosedImage, hold_out
 from .lens import lens_named
 
-CAMERAS = "cameras.json"
 CFG_ARGS = "cfg_args"  # the options of its training
 MAX_SKEW = 1e-3  # of a rotation, as far as rounded json numbers may leave it
 

@@ -16,6 +16,7 @@ from diff_smoe_rasterization import io
 
 from ..errors import SceneError, said_of
 from ..options.config import TrainConfig
+from ..options.early import NERF_SYNTHETIC, TRANSFORMS
 from ..system.files import is_file
 from .cameras import LARGEST, Camera
 from .images import image_size
@@ -24,7 +25,6 @@ from .lens import AROUND, FISHEYE, PERSPECTIVE, Lens, lens_of
 from .orbit import orbit_of_cameras
 from .pointcloud import SH_C0, PointCloud
 
-TRANSFORMS = "transforms.json"
 RANDOM_POINTS = 100_000  # as 3DGS
 HALF_SIDE = 1.3  # of the cube that random points fill: the extent of the NeRF-synthetic scenes
 DISTANCES = 1.5  # half the side of that cube in a capture, times the distance of its farthest camera
@@ -37,7 +37,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 def read_nerf_layout(folder: str, config: TrainConfig) -> Layout:
     """Reads both json files and points3d.ply if there is one; else points are random. Raises SceneError."""
-    train = _read_transforms(folder, "transforms_train.json")
+    train = _read_transforms(folder, NERF_SYNTHETIC)
     test = []
     if is_file(os.path.join(folder, "transforms_test.json")):
         test = _read_transforms(folder, "transforms_test.json")

@@ -17,16 +17,15 @@ import numpy as np
 
 from ..errors import SceneError
 from ..options.config import IMAGES, TrainConfig
-from ..options.early import check_scene
+from ..options.early import NERF_SYNTHETIC, SPARSE, TRANSFORMS, check_scene
 from ..system.files import is_file, is_folder
-from ..system.process import command
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import MAX_WIDTH, View, fitted_camera, load_views, shown_by_lens, size_of_image
 from .layout import Layout, PosedImage, check_lenses, with_lenses, with_masks, without_missing
 from .lens import NOT_UNDISTORTED
-from .modelfolder import CAMERAS, read_model_layout, rendered_views
-from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
+from .modelfolder import read_model_layout, rendered_views
+from .nerf import read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
 from .straight import pinhole_every
 from .undistortion import trains_natively, undistorted
@@ -93,21 +92,17 @@ def read_layout(config: TrainConfig) -> Layout:
     """Reads everything of a scene folder but its images, whose presence it checks."""
     folder = config.scene
     check_scene(folder)
-    if is_file(os.path.join(folder, "transforms_train.json")):
+    if is_file(os.path.join(folder, NERF_SYNTHETIC)):
         layout = read_nerf_layout(folder, config)
-    elif is_folder(os.path.join(folder, "sparse")):
+    elif is_folder(os.path.join(folder, SPARSE)):
         layout = read_colmap_layout(folder, config)
     elif is_file(os.path.join(folder, TRANSFORMS)):
         layout = read_transforms_layout(folder, config)
-    elif is_file(os.path.join(folder, CAMERAS)):
-        return _checked(folder, read_model_layout(folder, config))
     else:
-        raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
-                         "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
-                         f"`{command()} scene PHOTOS -o SCENE` makes a scene")
+        return _checked(folder, read_model_layout(folder, config))
     if layout.kind != "colmap" and config.images != IMAGES:
         raise SceneError(f"scene {folder}: --images is {config.images!r}, which is for a COLMAP scene; "
-                         f"{'transforms_train.json' if layout.kind == 'nerf-synthetic' else TRANSFORMS} says where its "
+                         f"{NERF_SYNTHETIC if layout.kind == 'nerf-synthetic' else TRANSFORMS} says where its "
                          "images are")
     layout = without_missing(folder, layout, config.strict)
     if not layout.train:

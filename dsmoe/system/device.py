@@ -1,16 +1,13 @@
 """The device that a command computes on: the one that is asked for, or by itself the GPU if it can be used."""
 from __future__ import annotations
 
-import os
 from typing import Optional
 
 import torch
 
 from ..errors import TrainerError
-from ..options.choices import DEVICES
+from ..options.choices import asked_device
 from .environment import extension_info, machine
-
-DEVICE_VARIABLE = "DSMOE_DEVICE"  # what `auto` means, if it is set
 
 
 def check_device(device: str) -> None:
@@ -38,11 +35,7 @@ def chosen_device(asked: Optional[str] = None) -> str:
 
     Raises TrainerError if the device that is asked for is none, or cannot be used.
     """
-    device, source = asked or "auto", "--device"
-    if device == "auto" and os.environ.get(DEVICE_VARIABLE):
-        device, source = os.environ[DEVICE_VARIABLE], DEVICE_VARIABLE
-    if device not in DEVICES:
-        raise TrainerError(f"{source} is {device!r}; it must be one of {', '.join(DEVICES)}")
+    device, _ = asked_device(asked)
     if device == "auto":
         return "cpu" if why_no_gpu() else "cuda"
     check_device(device)

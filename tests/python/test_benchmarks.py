@@ -179,6 +179,14 @@ def test_rows_are_read_as_the_report_reads_them():
     assert {row["cell"]: row for row in tables.rows_of("near_h100.jsonl")} == read
 
 
+@pytest.mark.parametrize("name, told", [("nowhere/x.png", "its folder is not there"), ("x.xyz", "name a .png")])
+def test_a_figure_that_cannot_be_written_is_told_before_the_tables(tmp_path, capsys, name, told):
+    with pytest.raises(SystemExit):
+        tables.main(["--figure", str(tmp_path / name)])
+    said = capsys.readouterr()
+    assert said.out == "" and f"error: --figure {tmp_path / name}: {told}" in said.err
+
+
 @needs_rows
 def test_the_figure_has_a_point_for_each_number(tmp_path):
     pytest.importorskip("matplotlib")

@@ -291,7 +291,11 @@ def test_quickstart_builds_no_kernels_where_there_is_no_gpu_unless_asked(tmp_pat
     ("--iterations 0", 1, "error: --iterations is 0; it must be at least 1"),
     ("--iterations", 2, "argument --iterations: expected one argument"),
     ("--strategy none", 2, "argument --strategy"), ("--itertions 10", 2, "unrecognized arguments: --itertions"),
-    ("--blend-mode smoe", 2, "unrecognized arguments: --blend-mode"), ("--budget 2", 1, "--budget is 2")])
+    ("--blend-mode smoe", 2, "unrecognized arguments: --blend-mode"), ("--budget 2", 1, "--budget is 2"),
+    (f"-o {__file__}", 1, f"{__file__}: nothing can be written there: {__file__} is no folder"),
+    (".", 1, "error: scene .: neither a folder `sparse` (COLMAP) nor"),
+    ("--find-links=", 1, "error: --find-links needs a folder of wheels"),
+    ("--find-links", 1, "error: --find-links needs a folder of wheels")])
 def test_quickstart_knows_before_it_builds_what_is_wrong_with_its_options(tmp_path, words, status, error):
     run = subprocess.run([str(ROOT / "quickstart"), *words.split()], cwd=str(tmp_path),
                          env={**os.environ, "DSMOE_VENV": "venv"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -301,7 +305,8 @@ def test_quickstart_knows_before_it_builds_what_is_wrong_with_its_options(tmp_pa
 
 
 @pytest.mark.parametrize("words", ["", "--budget 100", "--budget 100 --iterations 60 --device cpu"])
-def test_options_of_quickstart_that_fit_are_taken(words, capsys):
+def test_options_of_quickstart_that_fit_are_taken(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     assert quickstart_options.check(words.split()) == 0 and capsys.readouterr().err == ""
 
 

@@ -18,6 +18,7 @@ TIMES = ("train_seconds", "wall_seconds", "fps")  # of cells that shared their m
 FIELDS = ("psnr", "psnr_float", "psnr_edge", "ssim", "num_gaussians", "peak_gpu_mib", *TIMES)
 SHARED, MACHINES_DIFFER = "shared", "machines differ"  # why there is no time
 DASH = "–"
+UNREADABLE = r"\w+Error: \[Errno \d+\] .*?'.*?'"  # an OSError that names a file
 LPIPS = "lpips:"  # the figure's name goes on with its kind, such as lpips_alex
 
 
@@ -145,8 +146,9 @@ def lpips_figures(groups: Iterable[Group]) -> List[str]:
 
 
 def lpips_reasons(rows: Iterable[Row]) -> List[str]:
-    return sorted({f"{lpips['kind']}: {lpips['reason']}" for row in rows for lpips in _lpips(row)
-                   if lpips.get("value") is None and lpips.get("reason")})
+    """Why kinds of LPIPS were not measured; a file that could not be read is not named: it is of another machine."""
+    return sorted({f"{lpips['kind']}: {re.sub(UNREADABLE, 'weights not at hand', lpips['reason'])}"
+                   for row in rows for lpips in _lpips(row) if lpips.get("value") is None and lpips.get("reason")})
 
 
 def _lpips(row: Row) -> List[Row]:

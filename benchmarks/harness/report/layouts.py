@@ -21,10 +21,11 @@ END_NAMES = ("sparse", "dense")
 ABLATION = {"smoe_eq7": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d"}  # their cuts are the same
 PAPERS = f"smoe {PAPER_WORD}"  # the program that made the paper's figures
 COMPARED = ("alpha", "smoe")
-SEEDS = "seeds"  # the column that says how many seeds an average over scenes is of
+SCENES, SEEDS = "scenes", "seeds"  # the columns that say of which scenes and how many seeds an average is
 MOST_PAIRS = 20  # are named in a note
 SHARED_NOTE = (f"Times and FPS are of cells that shared no GPU or CPU. {grouping.SHARED}: several cells ran on "
                "it at once, so their times are left out; the rows have them.")
+SCENES_NOTE = "A method's averages are over the scenes that all of its blends have: compare rows of equal scenes only."
 SPREAD_NOTE = "± is the sample standard deviation over seeds; figures without it are of one seed."
 
 ByScene = Dict[str, Group]
@@ -59,7 +60,7 @@ def table1(groups: Sequence[Group]) -> Table:
     notes = [SOURCE, *_scene_notes(ours)]
     known = [scene for scenes in ours.values() for scene in scenes]
     ours.update({scene: [scene] for scene in sorted({group.scene for group in groups}) if known and scene not in known})
-    names = ["psnr", "ssim", "lpips:paper", *lpips_figures(groups), "num_gaussians_m", "size_own_mb", SEEDS]
+    names = ["psnr", "ssim", "lpips:paper", *lpips_figures(groups), "num_gaussians_m", "size_own_mb", SCENES, SEEDS]
     columns = [column(name, place if scenes in ([place], sorted(PAPER["datasets"].get(place, [])))
                       else f"{place} (ours: {', '.join(scenes)})")
                for place, scenes in ours.items() for name in names]
@@ -70,8 +71,9 @@ def table1(groups: Sequence[Group]) -> Table:
 
 def table2(groups: Sequence[Group]) -> Table:
     names = ["psnr", "ssim", "lpips:paper", *lpips_figures(groups), "num_gaussians_m", "size_own_mb", "train_seconds",
-             "fps", SEEDS]
-    scenes = sorted({group.scene for group in groups})
+             "fps", SCENES, SEEDS]
+    scenes = sorted({scene for end in END_NAMES for by_scene in _settings(groups, end, "table2").values()
+                     for scene in by_scene})
     rows, seed_notes = _both_ends(groups, "table2", [(None, scenes)], names)
     notes = [f"{PAPER['source']}; averages of three data sets.",
              f"Ours are averages over {', '.join(scenes)}: not the paper's scenes, and not its GPU."]
@@ -84,17 +86,22 @@ def _both_ends(groups: Sequence[Group], table: str, places: Sequence[Place],
     """The rows of Table 1 or 2, the paper's and ours at each end, and notes of the seeds that are left out."""
     rows: List[TableRow] = []
     notes: Dict[str, None] = {}
-    for end in END_NAMES:
+    of_end = {end: _settings(groups, end, table) for end in END_NAMES}
+    if any(_common(setting, settings, scenes) != [*scenes]
+           for settings in of_end.values() for setting in settings for _, scenes in places):
+        notes[SCENES_NOTE] = None
+    for end, settings in of_end.items():
         for method, averages in PAPER[table][end].items():
             figures = [cell for place, _ in places
                        for cell in _printed(table, averages.get(place) if place else averages, names)]
             rows.append(TableRow((end, method), figures, tables.PAPER))
-        settings = _settings(groups, end, table)
         for setting in settings:
-            means = [mean for _, scenes in places for mean in _averages(setting, settings, scenes, names)]
+            means = [mean for _, scenes in places
+                     for mean in _averages(setting, settings, scenes, names, SCENES_NOTE in notes)]
             rows.append(TableRow((end, setting.label()), means))
-            notes.update(dict.fromkeys(note for _, scenes in places
-                                       for note in _seed_notes(setting, _beside(setting, settings, scenes))))
+            notes.update(dict.fromkeys(
+                note for _, scenes in places
+                for note in _seed_notes(setting, _beside(setting, settings, _common(setting, settings, scenes)))))
     return rows, list(notes)
 
 
@@ -186,21 +193,33 @@ def _settings(groups: Sequence[Group], end: str, table: str) -> Dict[Setting, By
     return dict(sorted(found.items(), key=lambda item: item[0].order()))
 
 
+def _common(setting: Setting, settings: Dict[Setting, ByScene], scenes: Sequence[str]) -> List[str]:
+    """The scenes of which all blends of a method have rows; one that has none of these scenes does not count."""
+    blends = [by_scene for other, by_scene in settings.items()
+              if other.pair == setting.pair and {*by_scene} & {*scenes}]
+    return [scene for scene in scenes if all(scene in by_scene for by_scene in blends)]
+
+
 def _averages(setting: Setting, settings: Dict[Setting, ByScene], scenes: Sequence[str],
-              names: Sequence[str]) -> List[Cell]:
-    """The means over scenes, or which of them failed or were not run: an average never leaves a scene out."""
-    by_scene = settings[setting]
-    failed = [scene for scene in scenes if scene in by_scene and not by_scene[scene].rows]
-    absent = [scene for scene in scenes if scene not in by_scene]
-    common, left_out = _seeds(_beside(setting, settings, scenes))
-    if failed or absent or not common:
-        text = "failed" if failed else "not run" if absent else "no common seed"
-        if len(scenes) > 1 and (failed or absent):
-            text += ": " + ", ".join(failed or absent)
+              names: Sequence[str], names_scenes: bool) -> List[Cell]:
+    """The means over the scenes that are common to a method's blends, or why there is none.
+
+    A scene that failed is not left out: then there is no mean. names_scenes: the cells say which scenes these are.
+    """
+    by_scene, common_scenes = settings[setting], _common(setting, settings, scenes)
+    failed = [scene for scene in common_scenes if scene in by_scene and not by_scene[scene].rows]
+    is_absent = not {*by_scene} & {*scenes}
+    common, left_out = _seeds(_beside(setting, settings, common_scenes))
+    if failed or is_absent or not common:
+        text = ("failed" if failed else "not run" if is_absent else "no common scene" if not common_scenes
+                else "no common seed")
+        if len(scenes) > 1 and failed:
+            text += ": " + ", ".join(failed)
         return [Cell(text=text if name == "psnr" else "") for name in names]
-    seeds = Cell(text=f"{len(common)} of {len(common) + len(left_out)}") if left_out else Cell(len(common))
-    groups = [by_scene[scene] for scene in scenes]
-    return [seeds if name == SEEDS else over(groups, name, statistics.fmean, common) for name in names]
+    said = {SCENES: Cell(text=", ".join(common_scenes) if names_scenes else ""),
+            SEEDS: Cell(text=f"{len(common)} of {len(common) + len(left_out)}") if left_out else Cell(len(common))}
+    groups = [by_scene[scene] for scene in common_scenes]
+    return [said[name] if name in said else over(groups, name, statistics.fmean, common) for name in names]
 
 
 def _beside(setting: Setting, settings: Dict[Setting, ByScene], scenes: Sequence[str]) -> List[Group]:

@@ -14,7 +14,7 @@ from .groups import LPIPS, Cell
 OURS, PAPER = "ours", "paper"  # whose figures a row has
 # How a figure is headed and with how many digits it is printed.
 FIGURES: Dict[str, Tuple[str, int]] = {
-    "seeds": ("seeds", 0), "psnr": ("PSNR [dB]", 2), "psnr_float": ("PSNR, floats [dB]", 2),
+    "scenes": ("scenes", 0), "seeds": ("seeds", 0), "psnr": ("PSNR [dB]", 2), "psnr_float": ("PSNR, floats [dB]", 2),
     "psnr_edge": ("PSNR at edges [dB]", 2), "ssim": ("SSIM", 3), "num_gaussians": ("#Gaussians", 0),
     "num_gaussians_m": ("#G [M]", 3), "size_own_mb": ("own size [MB]", 1), "size_common_mb": ("common size [MB]", 1),
     "train_seconds": ("train [s]", 0), "wall_seconds": ("wall [s]", 0), "fps": ("FPS", 0),

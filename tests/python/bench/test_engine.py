@@ -238,8 +238,9 @@ def test_checkouts_that_are_not_there_are_told_and_left_out(content, tmp_path, b
     told = [f"left out: {line}" for line in reversed(lines)]
     assert bench(*run, "--dry-run")[1].splitlines()[3:] == [*told, "0 done, 3 to do, 0 failed"]
     assert "no such folder" not in bench(*run, "--dry-run", "--only", "method=native")[1]
-    status, words = bench(*run, "--only", "method=c3dgs")
-    assert status == 1 and f"{lines[1]}, or leave it out with --only" in words
+    for more in ([], ["--dry-run"]):
+        status, words = bench(*run, "--only", "method=c3dgs", *more)
+        assert status == 1 and f"error: {lines[1]}, or leave it out with --only" in words
     assert not (tmp_path / "results").exists()
 
 

@@ -60,11 +60,36 @@ def test_an_average_is_of_the_seeds_that_every_scene_has_in_both_modes():
     assert [note for note in table.notes if "averages leave" in note] == [
         "sparse, native: averages leave seed 1 out, since smoe failed on truck.",
         "sparse, native: averages leave seed 2 out, since smoe failed on train, smoe failed on truck."]
-    # A mode that lacks a scene has no average, and takes no seed from the other.
-    table = table_of([*alpha, smoe(scene="truck")], "table1")
-    assert shown(table, *columns, method="native, alpha") == ["18.00 ± 3.00", "3"]
     apart = [row("truck", seed=0), row("train", seed=1)]
     assert shown(table_of(apart, "table1"), columns[0]) == ["no common seed"]
+
+
+def test_an_average_is_of_the_scenes_that_all_blends_of_a_method_have_and_says_which():
+    c3dgs = {"method": "c3dgs", "variant": "patched", "end": "sparse"}
+    entries = [row("bonsai", psnr=30.0, **c3dgs), smoe(scene="bonsai", psnr=31.0, **c3dgs),
+               smoe(scene="fox", psnr=20.0, **c3dgs), row("lego", psnr=10.0)]  # lego: of no method of Table 2
+    columns = ["PSNR [dB]", "scenes"]
+    table = table_of(entries, "table2")
+    assert shown(table, *columns, method="c3dgs, alpha") == ["30.00", "bonsai"]
+    assert shown(table, *columns, method="c3dgs, smoe") == ["31.00", "bonsai"]
+    assert layouts.SCENES_NOTE in table.notes
+    table = table_of([*entries, row("fox", psnr=18.0, **c3dgs)], "table2")
+    assert shown(table, columns[0], method="c3dgs, alpha") == ["24.00"]
+    assert shown(table, columns[0], method="c3dgs, smoe") == ["25.50"]
+    assert layouts.SCENES_NOTE not in table.notes and any("averages over bonsai, fox:" in note for note in table.notes)
+    assert "scenes" not in [column.name for column in table.columns]
+    # A failure is a result: its scene is not left out.
+    table = table_of([*entries, failed(scene="fox", **c3dgs)], "table2")
+    assert shown(table, columns[0], method="c3dgs, alpha") == ["failed: fox"]
+    assert shown(table, columns[0], method="c3dgs, smoe") == ["25.50"]
+    apart = [row("bonsai", **c3dgs), smoe(scene="fox", **c3dgs)]
+    assert shown(table_of(apart, "table2"), columns[0], method="c3dgs, smoe") == ["no common scene"]
+
+
+def test_weights_that_were_not_there_are_named_without_a_path():
+    reason = "$DSMOE_LPIPS_VGG: FileNotFoundError: [Errno 2] No such file or directory: '/a/b.npz'"
+    table = table_of([row(lpips={"value": None, "kind": "lpips_vgg_std", "reason": reason})], "cells")
+    assert "Not measured, lpips_vgg_std: $DSMOE_LPIPS_VGG: weights not at hand." in table.notes
 
 
 def test_the_papers_figures_stand_beside_ours_and_are_marked():

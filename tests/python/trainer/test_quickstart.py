@@ -15,9 +15,9 @@ from PIL import Image
 
 from diff_smoe_rasterization.io import read_colmap, read_gaussians
 from dsmoe import cli, quickstart
-from dsmoe.options import short_run
+from dsmoe.options import quickstart_options, short_run
 from dsmoe.options.presets import FAST
-from dsmoe.options.quickstart_options import check, given_options, parse
+from dsmoe.options.quickstart_options import MADE_UP, check, given_options, output_and_subject, parse
 from dsmoe.results.pictures import MARGIN, comparison, evenly_spaced, window_of_differences
 from dsmoe.system import files
 
@@ -66,13 +66,29 @@ def test_two_runs_are_shown_beside_the_photograph_of_a_view(output, tiny_scene, 
         wanted = np.asarray(expected.resize(picture.size, Image.LANCZOS), np.float64)
         differs = np.abs(np.asarray(picture, np.float64) - wanted).mean(axis=(1, 2))
     assert picture.width == 300 and not differs[len(differs) // 10:].any(), "below the labels, which have other words"
-    with pytest.raises(SystemExit):
-        compare_runs.main([*runs, "-o", str(tmp_path / "b.png"), "--view", "view_001.png"])
-    assert "--view view_001.png: the test views are view_000.png, view_008.png" in capsys.readouterr().err
+    for given, told in (([*runs, "-o", "b.png", "--view", "view_001.png"],
+                         "--view view_001.png: the test views are view_000.png, view_008.png"),
+                        ([str(tmp_path / "nowhere"), runs[0], "-o", "b.png"], str(tmp_path / "nowhere")),
+                        ([*runs, "-o", "p.xyz"], "-o p.xyz: no picture ends in .xyz; name a .png or .jpg"),
+                        ([*runs, "-o", str(tmp_path / "a.png" / "b.png")], "a.png is no folder"),
+                        ([*runs, "-o", "b.png", "--width", "0"], "--width is 0; it must be at least 1")):
+        assert compare_runs.main(given) == 1
+        text = capsys.readouterr().err
+        assert told in text and text.count("\n") == 1
+
+
+def test_an_earlier_comparison_stays_unless_it_may_be_replaced(tiny_scene, output, capsys):
+    before = {path: path.stat().st_mtime_ns for path in output.rglob("*") if path.is_file()}
+    assert {"results.json", "alpha.ply", "smoe.ply"} < {path.name for path in before}
+    for run in (quickstart.main, check):  # the latter before anything is installed
+        assert run([tiny_scene, "-o", str(output), "--iterations", "20"]) == 1
+        text = capsys.readouterr().err
+        assert f"{output} holds an earlier comparison (results.json, alpha.ply" in text and "--overwrite" in text
+    assert before == {path: path.stat().st_mtime_ns for path in output.rglob("*") if path.is_file()}
 
 
 def test_the_table_and_a_second_run(tiny_scene, output, capsys):
-    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "20", "--quiet"]) == 0
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "20", "--quiet", "--overwrite"]) == 0
     text = capsys.readouterr().out
     for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", "\nsmoe (gate 0.",
                  "compare_view_000.png", "note: the smoe .ply holds gates; viewers"):
@@ -80,7 +96,7 @@ def test_the_table_and_a_second_run(tiny_scene, output, capsys):
 
 
 def test_the_last_line_is_a_command(output, tiny_scene, tmp_path, capsys):
-    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet"]) == 0
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet", "--overwrite"]) == 0
     said = capsys.readouterr().out.splitlines()[-1].partition("browser: ")[2]
     page = tmp_path / "model.html"
     subprocess.run([*shlex.split(said)[:-1], str(page)], check=True, stdout=subprocess.DEVNULL)
@@ -114,7 +130,7 @@ def test_another_scene_is_refused_and_no_picture_is_stale(tiny_scene, output, tm
         "alpha.ply", "smoe.ply", "results.json", "compare_view_000.png", "compare_view_008.png", "compare_old.png"]})
     (output / "compare_old.png").write_bytes(b"stale")
     (output / "mine.png").write_bytes(b"mine")
-    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet"]) == 0
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet", "--overwrite"]) == 0
     assert sorted(path.name for path in output.glob("*.png")) == ["compare_view_000.png", "compare_view_008.png",
                                                                   "mine.png"]
 
@@ -147,6 +163,19 @@ def test_a_budget_of_none_is_chosen(tiny_scene):
     assert check([tiny_scene, "--budget", "0"]) == 0
 
 
+@pytest.mark.parametrize("asks", [["--device", "cuda"], []])
+def test_that_no_gpu_is_there_is_told_without_torch(tiny_scene, tmp_path, monkeypatch, capsys, asks):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("DSMOE_DEVICE", "cpu" if asks else "cuda")
+    monkeypatch.setattr(quickstart_options, "GPU_FILES", (str(tmp_path / "nvidia*"),))
+    assert check([tiny_scene, *asks]) == 1
+    source = asks[0] if asks else "DSMOE_DEVICE"
+    assert f"error: {source} is cuda, and this machine has no NVIDIA GPU" in capsys.readouterr().err
+    (tmp_path / "nvidia0").touch()
+    assert check([tiny_scene, *asks]) == 0
+
+
 def test_large_scenes_are_reduced_and_told(monkeypatch, tiny_scene, capsys):
     monkeypatch.setattr(short_run, "MAX_PIXELS", 200)  # of 32x24: width 16.3
     assert quickstart.choose_options(tiny_scene, {}).resolution == 16
@@ -165,14 +194,21 @@ def test_a_gpu_trains_at_full_size(monkeypatch, tiny_scene, capsys):
 def test_each_scene_has_a_folder_of_its_name(tiny_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     scenes = [shutil.copytree(tiny_scene, str(tmp_path / parent / "garden")) for parent in ("one", "two")]
+    output = tmp_path / "quickstart_output"
     for scene in [*scenes, scenes[0]]:
         assert quickstart.main([scene, "--iterations", "10", "--quiet"]) == 0
         assert capsys.readouterr().out.startswith("device: cpu (")
-    assert sorted(os.listdir("quickstart_output")) == ["garden", "garden_2"]
-    subjects = [json.loads((tmp_path / "quickstart_output" / name / ".dsmoe.json").read_text())["of"]
-                for name in ("garden", "garden_2")]
-    assert subjects == scenes
-    assert quickstart.default_output(quickstart.MADE_UP) == "quickstart_output/room"
+    names = sorted(os.listdir("quickstart_output"))
+    subjects = [json.loads((output / name / ".dsmoe.json").read_text())["of"] for name in names]
+    assert dict(zip(names, subjects)) == {"garden": scenes[0], "garden_2": scenes[1], "garden_3": scenes[0]}
+    assert output_and_subject(parse([])) == ("quickstart_output/room", MADE_UP)
+    for options, name in (([], "garden_4"), (["--overwrite"], "garden_2")):
+        assert output_and_subject(parse([scenes[1], *options]))[0] == f"quickstart_output/{name}"
+    for name in json.loads((output / "garden" / ".dsmoe.json").read_text())["files"]:
+        (output / "garden" / name).unlink()  # as if it was interrupted before the first model
+    assert output_and_subject(parse([scenes[0]]))[0] == "quickstart_output/garden"
+    assert quickstart.main([scenes[0], "--iterations", "10", "--quiet"]) == 0
+    assert (output / "garden" / "results.json").is_file()
 
 
 def test_errors_are_one_line(tmp_path, capsys):
