@@ -21,6 +21,7 @@ from .presets import NUMBERS, STRATEGY
 MODES = ("alpha", "smoe")
 DEFAULT_FOLDER = "quickstart_output"  # has a folder for each scene
 PROGRAM = "quickstart"  # in its folder's record
+MODELS = "point_cloud"  # the folder of a run's models
 MADE_UP = "the one that it makes itself"
 MADE_UP_NAME = "room"
 GPU_FILES = ("/dev/nvidia*", "/dev/nvhost*", "/dev/dxg")  # one is there with a GPU: on Linux, on a Jetson, in WSL
@@ -86,8 +87,8 @@ def _default_output(subject: str, overwrite: bool) -> str:
 def earlier_files(output: str, subject: str, overwrite: bool) -> List[str]:
     """What an earlier comparison on the same scene has written.
 
-    Raises TrainerError if `output` holds another's, or some of these files that nobody lets be replaced. A comparison
-    that was interrupted before its first model has none.
+    Raises TrainerError if `output` holds another's, or some of these files or a model that nobody lets be replaced. A
+    comparison that was interrupted before its first model has none.
     """
     record = own_record(output, PROGRAM, folders=("scene", *MODES))
     if record.subject not in ("", subject):
@@ -101,7 +102,9 @@ def earlier_files(output: str, subject: str, overwrite: bool) -> List[str]:
 
 
 def _there(folder: str, names: List[str]) -> List[str]:
-    return [name for name in names if os.path.lexists(os.path.join(folder, name))]
+    """Which of these files, and models, are there: a model that is still being measured has no copy among the files."""
+    return [name for name in (*names, *(f"{mode}/{MODELS}" for mode in MODES))
+            if os.path.lexists(os.path.join(folder, name))]
 
 
 def check_gpu(device: Optional[str]) -> None:

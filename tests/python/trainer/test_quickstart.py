@@ -205,7 +205,12 @@ def test_each_scene_has_a_folder_of_its_name(tiny_scene, tmp_path, monkeypatch, 
     for options, name in (([], "garden_4"), (["--overwrite"], "garden_2")):
         assert output_and_subject(parse([scenes[1], *options]))[0] == f"quickstart_output/{name}"
     for name in json.loads((output / "garden" / ".dsmoe.json").read_text())["files"]:
-        (output / "garden" / name).unlink()  # as if it was interrupted before the first model
+        (output / "garden" / name).unlink()  # as if it was interrupted while the first model was measured
+    shutil.rmtree(output / "garden" / "smoe")
+    assert output_and_subject(parse([scenes[0]]))[0] == "quickstart_output/garden_4"
+    assert check([scenes[0], "-o", str(output / "garden")]) == 1
+    assert "earlier comparison (alpha/point_cloud)" in capsys.readouterr().err
+    shutil.rmtree(output / "garden" / "alpha" / "point_cloud")  # before the first model
     assert output_and_subject(parse([scenes[0]]))[0] == "quickstart_output/garden"
     assert quickstart.main([scenes[0], "--iterations", "10", "--quiet"]) == 0
     assert (output / "garden" / "results.json").is_file()
