@@ -415,6 +415,7 @@ def every_call():
                       "limit": 60.0},
         "set_inputs": {"to": alike(), "source": alike(), "numbers": torch.zeros(2), "new_numbers": [1.0, 2.0]},
         "add_view": {"dL_dmeans2D": raw[0], "radii": radii, "gradient_sum": depth, "view_count": depth.clone()},
+        "pixel_reach": {"radii": radii, "opacities": depth, "squared_reaches": depth},
         "mean_squared_neighbour_distances": {"points": raw[0]}}
     calls = {}
     for op, given in others.items():
