@@ -50,6 +50,8 @@ cv::Scalar scalar_of(const Color& color) { return {color[2] * 255, color[1] * 25
 }  // namespace
 
 Picture read_picture(const std::string& path) {
+  // OpenCV would print a warning of its own.
+  if (!std::filesystem::exists(path)) throw std::runtime_error(path + ": no such file");
   const cv::Mat bytes = cv::imread(path, cv::IMREAD_COLOR);
   if (bytes.empty()) throw std::runtime_error(path + ": is not a picture that OpenCV can read");
   return from_bytes(bytes);

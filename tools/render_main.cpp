@@ -10,6 +10,7 @@
 
 #include "command_line.h"
 #include "errors.h"
+#include "io/cursor.h"
 #include "model.h"
 #include "picture.h"
 #include "progress.h"
@@ -132,6 +133,17 @@ Orbit read_orbit(const CommandLine& line, const Extent& extent, ImageSize size) 
   return orbit;
 }
 
+[[noreturn]] void throw_no_view(const std::string& wanted, const std::vector<View>& views) {
+  constexpr std::size_t kShown = 3;
+  std::string names;
+  for (std::size_t i = 0; i < std::min(kShown, views.size()); ++i) {
+    names += (i == 0 ? "" : ", ") + io::printable(views[i].name, views[i].name.size());
+  }
+  throw UsageError("--view is " + io::printable(wanted) +
+                   ", and there is no such view; it must be a number from 0 to " + std::to_string(views.size() - 1) +
+                   ", or a name: " + names + (views.size() > kShown ? ", ..." : ""));
+}
+
 /// The views that the command line asks for, of their final size.
 std::vector<View> choose_views(const CommandLine& line, const Model& model) {
   const ImageSize size = read_size(line);
@@ -143,6 +155,7 @@ std::vector<View> choose_views(const CommandLine& line, const Model& model) {
     const std::string wanted = line.text("view", "");
     auto found = std::find_if(views.begin(), views.end(), [&](const View& view) { return view.name == wanted; });
     if (found == views.end()) {
+      if (double number = 0; !io::parse_number(wanted, number)) throw_no_view(wanted, views);
       found = views.begin() + line.whole("view", 0, 0, static_cast<int>(views.size()) - 1);
     }
     views = {*found};

@@ -4,10 +4,47 @@
 #include <filesystem>
 #include <random>
 
+#include "dsmoe/blend.h"
 #include "gaussians.h"
 #include "io/cursor.h"
+#include "io/file.h"
 
 namespace {
+
+using Options = std::map<std::string, std::string>;
+
+// A whole number from `least` to `most`; throws if the option is anything else.
+uint64_t whole(const Options& options, const std::string& name, uint64_t least, uint64_t most) {
+  uint64_t value = 0;
+  if (dsmoe::io::parse_whole(options.at(name), value) && value >= least && value <= most) return value;
+  throw std::invalid_argument(name + " is " + dsmoe::io::printable(options.at(name)) +
+                              "; it must be a whole number from " + std::to_string(least) + " to " +
+                              std::to_string(most));
+}
+
+void check_mode(const std::string& mode) {
+  std::string names;
+  bool known = false;
+  dsmoe::BlendModes::for_each([&](auto one) {
+    const std::string name = dsmoe::Blend<decltype(one)::value>::kName;
+    known = known || name == mode;
+    names += (names.empty() ? "" : ", ") + name;
+  });
+  if (known) return;
+  throw std::invalid_argument("--blend-mode is " + dsmoe::io::printable(mode) + "; it must be one of " + names);
+}
+
+// Makes the folder of the file. Throws if the file cannot be written there.
+void prepare_output(const std::filesystem::path& file) {
+  std::error_code error;
+  std::filesystem::create_directories(file.parent_path(), error);
+  const std::string folder = file.parent_path();
+  if (error) {
+    throw std::invalid_argument(dsmoe::io::printable(folder, folder.size()) + " cannot be made: " + error.message() +
+                                "; OUT must be a folder to write in");
+  }
+  dsmoe::io::OutputFile{file.string()};  // throws if it cannot be written, and leaves nothing
+}
 
 // Blend mode, and the background's gate lambda: a number, or learned with the scene as bound + exp(p). As in `dsmoe
 // train` it starts at 0.1 without a bound in `smoe`, with the rate 0.03, and at 1 with the bound 0.03 and the rate 0.01
@@ -24,6 +61,7 @@ struct Blend {
         bound(mode == "smoe" ? 0 : 0.03),
         start(mode == "smoe" ? 0.1 : 1),
         rate(mode == "smoe" ? 0.03 : 0.01) {
+    check_mode(mode);
     if (!has_gate) {
       if (!gate.empty()) throw std::invalid_argument("--background-gate is for --blend-mode smoe and smoe_eq7 only");
       return;
@@ -66,19 +104,23 @@ void show_progress(int iteration, int iterations, double seconds, double loss, i
                iteration / seconds, loss, static_cast<long long>(count));
 }
 
-void train(const std::string& folder, const std::string& output, std::map<std::string, std::string> options) {
-  const auto path = std::filesystem::path(output) / "point_cloud" / ("iteration_" + options["--iterations"]);
+void train(const std::string& folder, const std::string& output, Options options) {
+  const auto iterations = static_cast<int>(whole(options, "--iterations", 1, INT32_MAX));
+  const auto divisor = static_cast<int>(whole(options, "--divisor", 1, INT32_MAX));
+  const uint64_t seed = whole(options, "--seed", 0, UINT64_MAX);
+  const auto path = std::filesystem::path(output) / "point_cloud" / ("iteration_" + std::to_string(iterations));
   const std::string file = path / "point_cloud.ply";
   if (std::filesystem::exists(file) && options.count("--overwrite") == 0)
     throw std::invalid_argument(dsmoe::io::printable(file, file.size()) +
                                 " is there already; --overwrite replaces it, another OUT keeps it");
   const torch::Device device(options["--device"]);
-  torch::manual_seed(std::stoull(options["--seed"]));
-  std::mt19937_64 random(std::stoull(options["--seed"]));
+  torch::manual_seed(seed);
+  std::mt19937_64 random(seed);
   Blend blend(options["--blend-mode"], options["--background-gate"], device);
-  const Recipe recipe = Recipe::of(std::stoi(options["--iterations"]));
-  const Scene scene = load_scene(folder, options["--images"], std::stoi(options["--divisor"]), device);
+  const Recipe recipe = Recipe::of(iterations);
+  const Scene scene = load_scene(folder, options["--images"], divisor, device);
   Gaussians gaussians(scene, recipe);
+  prepare_output(file);
 
   std::vector<const View*> left;  // of an epoch: each view is seen once before any comes again
   const auto begin = std::chrono::steady_clock::now();
@@ -106,7 +148,6 @@ void train(const std::string& folder, const std::string& output, std::map<std::s
     }
   }
 
-  std::filesystem::create_directories(path);
   gaussians.save(file, blend.mode, blend.gate());
   evaluate(scene.test, gaussians, blend);
 }
@@ -114,13 +155,13 @@ void train(const std::string& folder, const std::string& output, std::map<std::s
 }  // namespace
 
 int main(int argc, char** argv) {
-  std::map<std::string, std::string> options = {{"--blend-mode", "alpha"},
-                                                {"--background-gate", ""},
-                                                {"--iterations", "30000"},
-                                                {"--divisor", "1"},
-                                                {"--images", "images"},
-                                                {"--device", "cpu"},
-                                                {"--seed", "0"}};
+  Options options = {{"--blend-mode", "alpha"},
+                     {"--background-gate", ""},
+                     {"--iterations", "30000"},
+                     {"--divisor", "1"},
+                     {"--images", "images"},
+                     {"--device", "cpu"},
+                     {"--seed", "0"}};
   try {
     if (argc < 3) throw std::invalid_argument("usage: train SCENE OUT [--overwrite] [--OPTION VALUE]...");
     for (int i = 3; i < argc; ++i) {

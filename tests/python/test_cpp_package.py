@@ -321,8 +321,19 @@ def test_the_cpp_trainer_refuses_what_it_would_ignore_or_lose(cpp_trainer, tmp_p
     assert said("--background-gate", "0.5") == "--background-gate is for --blend-mode smoe and smoe_eq7 only\n"
     assert (said("--blend-mode", "smoe", "--background-gate", "0.5x")
             == '--background-gate is "0.5x"; it must be learned, or a number from 0 to 1e30\n')
+    assert (said("--blend-mode", "smo", "--background-gate", "0.5")
+            == '--blend-mode is "smo"; it must be one of alpha, smoe, smoe_eq7, smoe_tn, smoe_std\n')
+    for name, least, wrong in (("--iterations", 1, ("1e4", "0", "-5", "2147483648")),
+                               ("--divisor", 1, ("2x", "1.5", "0")), ("--seed", 0, ("abc", "-1", ""))):
+        for value in wrong:
+            assert said(name, value).startswith(f'{name} is "{value}"; it must be a whole number from {least} to ')
     assert said("--seed") == "--seed needs a value\n" and said("--sed", "0") == "there is no option --sed\n"
     assert not (tmp_path / "out").exists()
+    (tmp_path / "out").write_text("mine")
+    refused = said()
+    assert "out/point_cloud/iteration_2\" cannot be made: Not a directory; OUT must be" in refused
+    assert "it/s" not in refused, "it trained before it said so"
+    (tmp_path / "out").unlink()
     said(status=0)
     model = tmp_path / "out" / "point_cloud" / "iteration_2" / "point_cloud.ply"
     first = model.read_bytes()
@@ -340,9 +351,9 @@ def test_the_cpp_trainer_is_as_good_as_pythons(cpp_trainer, tmp_path, options):
     write_synthetic_scene(str(tmp_path / "scene"), views=24, width=100, height=75, points=1000, supersampling=1)
     printed = run(cpp_trainer, tmp_path / "scene", tmp_path / "cpp", "--iterations", "300", *options)
     if not options:
-        wrong = subprocess.run([str(cpp_trainer), str(tmp_path / "scene"), str(tmp_path / "no"), "--blend-mode",
-                                "smo"], stderr=subprocess.PIPE, universal_newlines=True)
-        assert wrong.returncode == 1 and "'smo'; it must be one of alpha" in wrong.stderr
+        wrong = subprocess.run([str(cpp_trainer), str(tmp_path / "scene"), str(tmp_path / "no"), "--device",
+                                "quark"], stderr=subprocess.PIPE, universal_newlines=True)
+        assert wrong.returncode == 1 and "quark" in wrong.stderr
         assert wrong.stderr.count("\n") == 1, "without the trace of LibTorch's errors"
     ours = float(re.search(r"test PSNR ([0-9.]+) dB", printed).group(1))
     assert main(["train", str(tmp_path / "scene"), "-o", str(tmp_path / "python"), "--iterations", "300", "--quiet",

@@ -282,6 +282,26 @@ def test_results_that_are_there_stay(tmp_path, name, file):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
+def test_a_name_that_no_view_has_is_said_with_some_that_are(tmp_path):
+    io.write_gaussians(tmp_path / "model.ply", model("alpha"))
+    cameras = write_cameras(tmp_path, "cameras.json")
+    camera = json.loads(cameras.read_text())[0]
+    cameras.write_text(json.dumps([{**camera, "img_name": f"street_{i}"} for i in range(4)]))
+    words = [tmp_path / "model.ply", "--cameras", cameras, "--device", "cpu", "-o", tmp_path / "out.png", "--view"]
+    said = tool("dsmoe_render", *words, "images/street.png", status=2)
+    assert ('--view is "images/street.png", and there is no such view; it must be a number from 0 to 3, or a name: '
+            '"street_0", "street_1", "street_2", ... (') in said
+    assert '--view is "4"; it must be a number from 0 to 3' in tool("dsmoe_render", *words, 4, status=2)
+    tool("dsmoe_render", *words, "street_2")
+
+
+def test_a_picture_that_is_not_there_is_said_without_a_warning_of_opencv(tmp_path):
+    said = tool("dsmoe_fit2d", tmp_path / "no.png", "-o", tmp_path / "out", status=1)
+    assert said == f"dsmoe_fit2d: {tmp_path / 'no.png'}: no such file\n"
+    (tmp_path / "text.png").write_text("mine")
+    assert "is not a picture" in tool("dsmoe_fit2d", tmp_path / "text.png", "-o", tmp_path / "out", status=1)
+
+
 @pytest.mark.parametrize("name", ["dsmoe_render", "dsmoe_fit2d"])
 def test_help_and_wrong_options(name):
     assert f"usage: {name}" in tool(name, "--help")
