@@ -159,7 +159,7 @@ def recipe_table() -> str:
     return table(["", "alpha", "smoe", "near edges"], (
         [f"{scene} {threshold:g}", *(quality(rules[blend]) for blend in BLENDS),
          signed(less(rules["smoe"], rules["alpha"], "psnr_edge"), 1)]
-        for (scene, threshold), rules in recipe_cells().items() if threshold in (0.005, 0.001, 0.0002)))
+        for (scene, threshold), rules in recipe_cells().items()))
 
 
 def number_at(points: Sequence[Tuple[float, float]], psnr: float) -> Optional[float]:
@@ -485,8 +485,8 @@ def lens_table() -> str:
     columns = {"pinhole": "trained on the photographs", "undistort": "undistorted", "native": "through the lens alone",
                16: "every 16th view by a pinhole", 8: "8th", 4: "4th"}
     return table(["", *columns.values()], ([f"{blend}: {', '.join(lenses.values())}", *(", ".join(
-        f"{mean(cells[blend, lens, how], 'psnr_pinhole'):.2f}" for lens in lenses if (blend, lens, how) in cells)
-        for how in columns)] for blend in BLENDS))
+        f"{mean(cells[blend, lens, how], 'psnr_pinhole'):.2f}" if (blend, lens, how) in cells else "–"
+        for lens in lenses) for how in columns)] for blend in BLENDS))
 
 
 def lens_times() -> str:

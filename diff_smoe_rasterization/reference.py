@@ -727,7 +727,7 @@ def blend(alpha, color, depth, bg, mode, gate, tails):
     if isinstance(gate, torch.Tensor) or gate:
         background = background + gate * (1 - alpha).masked_fill(stopped, 1).prod(0)  # lambda T, behind the last pair
     # alpha (Eq. 3) divides by 1, which this sum is only to rounding; Eq. 7 (smoe, smoe_eq7), 8 (smoe_tn) and 6
-    # (smoe_std) differ in weight and gate_sum, and the background has a weight only in the first two.
+    # (smoe_std) differ in weight and gate_sum. Of these the background has a weight only in the first two.
     total = torch.ones_like(gate_sum) if mode == "alpha" else gate_sum + background
 
     of_background = background * bg[:, None]

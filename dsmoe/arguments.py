@@ -157,7 +157,7 @@ def build_parser() -> argparse.ArgumentParser:
                         help=f"(default: {choices.BAKE_ITERATIONS})")
     _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
     export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
-    _add_device(export)
+    _add_device(export, "--bake trains")
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
                                description="Serves a live viewer of a run's model, of the checkpoints of a training "
@@ -242,9 +242,9 @@ def _add_paper(parser: Any) -> None:
                             f"--{name.replace('_', '-')} {value}" for name, value in PAPER_PROGRAM.items()))
 
 
-def _add_device(parser: argparse.ArgumentParser) -> None:
+def _add_device(parser: argparse.ArgumentParser, does: str = "to render") -> None:
     parser.add_argument("--device", choices=choices.DEVICES, default="auto",
-                        help="where to render; auto: $DSMOE_DEVICE, else the GPU if it can be used (default: auto)")
+                        help=f"where {does}; auto: $DSMOE_DEVICE, else the GPU if it can be used (default: auto)")
 
 
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:

@@ -57,7 +57,8 @@ def main(argv: Optional[List[str]] = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        text = str(error) if isinstance(error, PatchError) else in_one_line(error)
+        of_patch = isinstance(error, PatchError)  # which lists reasons line by line
+        text = "\n".join(map(printable, str(error).split("\n"))) if of_patch else in_one_line(error)
         if text is None:
             raise
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)

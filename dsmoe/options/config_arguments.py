@@ -63,6 +63,7 @@ def _number_or_learned(text: str) -> Union[float, str]:
 
 _TYPES = {"int": whole_number, "float": number, "str": str, "Optional[str]": str, "Optional[float]": number,
           "Union[float, str, None]": _number_or_learned}
+_TYPES_OF = {"blend_mode": blend_mode, "init": file_name}  # that the field's own type does not say
 
 
 def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
@@ -85,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         if option.type == "bool":
             group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue
-        kind = blend_mode if option.name == "blend_mode" else _TYPES[str(option.type)]
+        kind = _TYPES_OF.get(option.name) or _TYPES[str(option.type)]
         keywords: Dict[str, Any] = {"type": kind, "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True

@@ -7,7 +7,7 @@ import os
 from ..errors import ConfigError, SceneError, TrainerError
 from ..system.files import check_output, check_place, is_file, is_folder
 from ..system.process import command, typed
-from .choices import MODEL, ORBIT_FRAMES, VIDEO_FPS
+from .choices import DEVICES, MODEL, ORBIT_FRAMES, VIDEO_FPS
 from .config import TrainConfig, holds_run
 from .config_arguments import given_options
 
@@ -15,6 +15,7 @@ from .config_arguments import given_options
 SPARSE, TRANSFORMS, NERF_SYNTHETIC, CAMERAS = "sparse", "transforms.json", "transforms_train.json", "cameras.json"
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 FILMED = (".mp4", ".gif", ".webp")  # what an orbit can be written as
+FILMED_SAID = f"{', '.join(FILMED[:-1])} or {FILMED[-1]}"
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # nor is that a folder's name
 FROM_VIDEO = "of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
 MOST_FRAMES = 100_000  # 55 minutes
@@ -62,6 +63,10 @@ def _check_meant(arguments: argparse.Namespace) -> None:
         if hasattr(arguments, name) and not getattr(arguments, other):
             raise TrainerError(f"--{name.replace('_', '-')} means something with {partner} alone; add that, or leave "
                                "it out")
+    if arguments.command == "export" and arguments.device != DEVICES[0] and not arguments.bake:
+        raise TrainerError("--device means something with --bake alpha alone; add that, or leave it out")
+    if hasattr(arguments, "fps") and not is_video(arguments.output):
+        raise TrainerError(f"--fps means something with a video alone; end -o in {FILMED_SAID}, or leave it out")
     if getattr(arguments, "orbit", False) and arguments.split:
         raise TrainerError("--split names cameras of the scene, and --orbit has its own; leave out one of the two")
 
@@ -128,8 +133,7 @@ def check_ending(path: str, orbit: bool) -> None:
     if ending in IMAGE_ENDINGS:
         raise TrainerError(f"{path}: -o names a folder for images")
     if ending in VIDEO_ENDINGS and ending not in FILMED:
-        raise TrainerError(f"{path}: a video can end in {', '.join(FILMED[:-1])} or {FILMED[-1]}; {ending} is not "
-                           "written")
+        raise TrainerError(f"{path}: a video can end in {FILMED_SAID}; {ending} is not written")
 
 
 def _ending(path: str) -> str:

@@ -198,7 +198,7 @@ def agreed_faint_below(path: str, blend_mode: str, recorded: Recorded, asked: Op
     if asked in (None, known):
         return recorded.faint_below
     if recorded.blend_mode is not None or recorded.faint_below is not None or blend_mode not in GATED_MODES:
-        raise TrainerError(f"{path}: in the blend mode {blend_mode} its faint_below is {known:g}, not {asked:g}")
+        raise TrainerError(f"{path}: in the blend mode {blend_mode} its faint_below is {known!r}, not {asked!r}")
     try:
         return resolve_faint_below(blend_mode, asked)
     except ValueError as error:

@@ -210,8 +210,11 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         "export|nowhere": "no such file or folder", f"export|{ply}|-o|{ply}": "--overwrite replaces it",
         f"render|{ply}|-o|o|--frames|3": "--frames means something with --orbit alone",
         f"render|{ply}|-o|o|--fps|3": "--fps means something with --orbit alone",
+        f"render|{ply}|-o|o|--orbit|--fps|3": "--fps means something with a video alone; end -o in .mp4, .gif or .webp",
         f"render|{ply}|-o|o|--orbit|--split|test": "leave out one of the two",
-        f"export|{ply}|--bake-iterations|3": "--bake-iterations means something with --bake alpha alone"}
+        f"export|{ply}|--bake-iterations|3": "--bake-iterations means something with --bake alpha alone",
+        f"export|{ply}|--device|cuda": "--device means something with --bake alpha alone",
+        **{f"{words}|a\x1b[31m": r"a\x1b[31m: " for words in ("eval", "patch|check")}}
     listed = {"": "measure a trained run again", "patch": "take the patch out of every file",
               "bench": "run what is not done yet of a suite"}
     package = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))
@@ -234,7 +237,8 @@ def test_what_is_wrong_with_paths_and_options_is_said_before_torch_is_loaded(sce
         ("train s -o ''", "-o/--output"), ("scene p -o ''", "-o/--output"), ("scene '' -o o", "PHOTOS"),
         ("bench run smoke -o ''", "-o/--output"), ("bench report r -o ''", "-o/--output"),
         ("bench run ''", "SUITE"), ("bench report ''", "RESULTS"), ("patch check ''", "PATH"),
-        ("eval o --scene ''", "--scene"), ("render m.ply -o o --scene ''", "--scene")))])
+        ("eval o --scene ''", "--scene"), ("render m.ply -o o --scene ''", "--scene"),
+        ("train s -o o --init ''", "--init")))])
 def test_what_is_no_number_or_no_name_is_told(words, error, capsys):
     with pytest.raises(SystemExit):
         main(shlex.split(words))
@@ -564,7 +568,7 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
         text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--background-gate", "0.5")
         assert f"gate {GATE}, not 0.5" in text
         text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--faint-below", "0.5")
-        assert "in the blend mode smoe_eq7 its faint_below is 2, not 0.5" in text
+        assert "in the blend mode smoe_eq7 its faint_below is 2.0, not 0.5" in text
     text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe_eq7")
     assert "bare.ply" in text and "--background-gate" in text
     assert "gate 0.0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
@@ -845,6 +849,7 @@ def test_an_interrupted_rendering_leaves_whole_images(trained, tmp_path, monkeyp
     def interrupted_save(self, file, **options):
         save(self, file, **options)
         if (tmp_path / "view_000.png").exists():  # the second one is not whole yet
+            assert signal.getsignal(number) != signal.SIG_DFL, "it would end the tests"
             os.kill(os.getpid(), number)
 
     with monkeypatch.context() as patch:
@@ -852,6 +857,18 @@ def test_an_interrupted_rendering_leaves_whole_images(trained, tmp_path, monkeyp
         assert main(words) == status
     assert sorted(os.listdir(tmp_path)) == [".dsmoe.json", ".dsmoe.lock", "view_000.png"]
     assert main(words) == 0 and "view_008.png" in os.listdir(tmp_path)
+
+
+def test_an_interrupted_rendering_leaves_no_half_of_a_depth_map(trained, tmp_path, monkeypatch):
+    save = np.save
+
+    def interrupted_save(file, arr):
+        save(file, arr)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "save", interrupted_save)
+    assert main(["render", trained, "--depth", "-o", str(tmp_path)]) == 130
+    assert sorted(os.listdir(tmp_path)) == [".dsmoe.json", ".dsmoe.lock", "view_000.png"]
 
 
 def test_names_of_images_need_not_be_utf_8(scene, tmp_path, capsys):

@@ -80,8 +80,9 @@ def test_a_file_without_a_record_is_declared_by_the_options(model, tiny_scene, t
     assert (viewed.blend_mode, viewed.background_gate, viewed.faint_below) == blend
     for source, wrong, said in (
             (path, ["--blend-mode", "smoe"], f"{path} does not say which background gate it was trained with; pass"),
-            (declared, ["--faint-below", "0.5"], f"its faint_below is {blend[2] or 0.25:g}, not 0.5"),
-            (path, ["--faint-below", "0.5"], "in the blend mode alpha its faint_below is 2, not 0.5"),
+            (declared, ["--faint-below", "0.5"], f"its faint_below is {float(blend[2] or 0.25)}, not 0.5"),
+            (declared, ["--faint-below", "0.1234567"], f"is {float(blend[2] or 0.25)}, not 0.1234567\n"),
+            (path, ["--faint-below", "0.5"], "in the blend mode alpha its faint_below is 2.0, not 0.5"),
             (path, ["--paper", "--faint-below", "0.5"], "--faint-below is 0.5; with --paper it is 2"),
             (path, ["--blend-mode", "smoe", "--background-gate", "0", "--faint-below", "-1"], "faint_below is -1")):
         capsys.readouterr()
@@ -183,7 +184,7 @@ def test_a_learned_gate_that_no_file_records_is_asked_for(model, tiny_scene, tmp
     assert load_model(declared, "cpu")[1] == ("smoe", 0.125, None)
     cfg_args.write_text(text.replace("source", "faint_below=1.5, source"))
     for words, wrong in ((["--blend-mode", "alpha"], "was trained with the blend mode smoe, not alpha"),
-                         (["--background-gate", "0.125", "--faint-below", "3"], "its faint_below is 1.5, not 3")):
+                         (["--background-gate", "0.125", "--faint-below", "3"], "its faint_below is 1.5, not 3.0")):
         assert main(["export", str(tmp_path / "model"), "-o", str(tmp_path / "no.html"), *words]) == 1
         assert wrong in capsys.readouterr().err
     assert main(["export", str(ply), "-o", declared, "--background-gate", "0.5", "--overwrite"]) == 0

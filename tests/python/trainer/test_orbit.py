@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from diff_smoe_rasterization import io
+from dsmoe import filming
 from dsmoe.cli import main
 from dsmoe.errors import SceneError
 from dsmoe.inspection import open_trained, to_image
@@ -176,9 +177,12 @@ def test_an_mp4_plays_every_frame(tmp_path):
     *(("a.gif", ["--fps", fps], f"--fps is {fps}; it must be from 0.01 to 1000")
       for fps in ("0", "1e-308", "0.009", "-1", "1001", "inf", "nan")),
     ("a.gif", ["--frames", "100001"], "--frames is 100001; it must be from 1 to 100000"),
-    ("a.png", [], "a.png: -o names a folder for images"),
+    *(("a" + ending, [], f"a{ending}: -o names a folder for images")
+      for ending in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".JPG")),
     ("a.mov", [], "a video can end in .mp4, .gif or .webp; .mov is not written")])
-def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, arguments, text):
+def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, monkeypatch, output, arguments, text):
+    for name in ("write_images", "write_video"):
+        monkeypatch.setattr(filming, name, lambda *_: pytest.fail("it is filmed"))
     assert orbit(model, tmp_path / output, *arguments) == 1
     assert text in capsys.readouterr().err and not (tmp_path / output).exists()
 

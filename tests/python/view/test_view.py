@@ -274,6 +274,15 @@ def test_an_error_of_one_browser_is_said_in_its_panel(model):
     assert good.text.content.startswith("60 Gaussians") and good.text.content.endswith("a trouble")
 
 
+def test_a_moving_picture_of_a_slow_machine_keeps_a_least_size(model):
+    pictures = []
+    scene = SimpleNamespace(set_background_image=lambda image, **_: pictures.append(image))
+    client = server._Client(SimpleNamespace(gui=Panel(), scene=scene, camera=handle_of()))
+    client.moved, client.seconds_per_pixel = math.inf, 1e6
+    client.show(Followed(model), Look(Blend("smoe")))
+    assert [picture.shape for picture in pictures] == [(16, 16, 3)] and not client.sharp
+
+
 def test_the_server_refuses_other_pages_and_outlives_bad_messages(model, capsys, caplog):
     viser = pytest.importorskip("viser")
     import msgspec
