@@ -106,7 +106,9 @@ def test_the_command_says_in_one_line_that_nothing_was_built(copied_package):
     info = run("info")
     assert info.returncode == 0
     assert re.search("^extension +not usable: .*not built.*pip install.*$", info.stdout, re.MULTILINE)
-    train = run("train", ".", "-o", "out", "--blend-mode", "smoe")
+    (folder.parent / "scene").mkdir()
+    (folder.parent / "scene" / "transforms.json").write_text("{}", encoding="utf-8")
+    train = run("train", "scene", "-o", "out", "--blend-mode", "smoe")
     assert train.returncode == 1
     assert re.fullmatch("dsmoe train: error: .*not built.*pip install.*\n", train.stderr)
     # What computes nothing works without it.
