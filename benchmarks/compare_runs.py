@@ -66,6 +66,7 @@ def compare(arguments: argparse.Namespace) -> None:
         labelled.append((f"{renderer.blend_mode}, {renderer.model.num_gaussians:,} Gaussians, "
                          f"{psnr(quantised(color), truth, view.mask_float()):.2f} dB", to_image(color)))
     sheet = comparison(to_image(truth), labelled)
+    os.makedirs(os.path.dirname(arguments.output) or ".", exist_ok=True)
     height = round(sheet.height * arguments.width / sheet.width)
     sheet.resize((arguments.width, height), Image.LANCZOS).save(arguments.output, quality=85)
 

@@ -7,6 +7,7 @@ background's gate. Whatever the command starts has them. That nothing was render
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import signal
@@ -227,10 +228,11 @@ def _script(words: Sequence[str]) -> Optional[Path]:
 
 def _missing_script(words: Sequence[str]) -> str:
     """Returns the script that a command of Python names and that is not there, else ""."""
-    first = next((number for number, word in enumerate(words) if number and not word.startswith("-")), 0)
-    is_script = re.fullmatch(r"python[\d.]*", Path(words[0]).name) and words[first].endswith(".py") and (
-        words[first - 1] not in ("-c", "-m"))
-    return words[first] if is_script and not Path(words[first]).exists() else ""
+    options = list(itertools.takewhile(lambda word: word.startswith("-"), words[1:]))
+    script = "".join(words[1 + len(options):][:1])
+    runs_other = any(word == "-" or word.startswith(("-c", "-m")) for word in options)  # what is typed, code, a module
+    is_script = re.fullmatch(r"python[\d.]*", Path(words[0]).name) and script.endswith(".py") and not runs_other
+    return script if is_script and not Path(script).exists() else ""
 
 
 def _folders(script: Optional[Path]) -> List[Path]:

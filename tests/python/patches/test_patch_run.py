@@ -146,6 +146,15 @@ PYTHON = [*RUN, "--", sys.executable, "train.py"]
 AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
 
 
+@pytest.mark.parametrize("words, missing", [
+    ("python train.py", "train.py"), ("python3.12 -u -O train.py a.py", "train.py"), ("python", ""), ("python -i", ""),
+    ("python - a.py", ""), ("python -cpass a.py", ""), ("python -c pass a.py", ""), ("python -mtimeit a.py", ""),
+    ("torchrun train.py", "")])
+def test_a_missing_script_is_one_that_python_would_open(words, missing, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run._missing_script(words.split()) == missing
+
+
 @pytest.mark.parametrize("files, words, said", [
     ({}, ["run", "--", "python", "train.py"], "--blend-mode"), ({}, ["run", "--blend-mode", "smooth"], "smoe_tn"),
     ({}, [*RUN, "--"], "there is no command"), ({}, ["run", "--blend_mode", "smoe", "--"], "there is no command"),

@@ -61,8 +61,8 @@ def test_pictures_show_truth_and_both_modes(output):
 
 def test_two_runs_are_shown_beside_the_photograph_of_a_view(output, tiny_scene, tmp_path, capsys):
     runs = [str(output / mode) for mode in ("alpha", "smoe")]
-    compare_runs.main([*runs, "-o", str(tmp_path / "a.png"), "--view", "view_008.png", "--width", "300"])
-    with Image.open(tmp_path / "a.png") as picture, Image.open(output / "compare_view_008.png") as expected:
+    compare_runs.main([*runs, "-o", str(tmp_path / "new" / "a.png"), "--view", "view_008.png", "--width", "300"])
+    with Image.open(tmp_path / "new" / "a.png") as picture, Image.open(output / "compare_view_008.png") as expected:
         wanted = np.asarray(expected.resize(picture.size, Image.LANCZOS), np.float64)
         differs = np.abs(np.asarray(picture, np.float64) - wanted).mean(axis=(1, 2))
     assert picture.width == 300 and not differs[len(differs) // 10:].any(), "below the labels, which have other words"
