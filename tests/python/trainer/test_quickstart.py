@@ -70,7 +70,7 @@ def test_two_runs_are_shown_beside_the_photograph_of_a_view(output, tiny_scene, 
                          "--view view_001.png: the test views are view_000.png, view_008.png"),
                         ([str(tmp_path / "nowhere"), runs[0], "-o", "b.png"], str(tmp_path / "nowhere")),
                         ([*runs, "-o", "p.xyz"], "-o p.xyz: no picture ends in .xyz; name a .png or .jpg"),
-                        ([*runs, "-o", str(tmp_path / "a.png" / "b.png")], "a.png is no folder"),
+                        ([*runs, "-o", str(tmp_path / "new" / "a.png" / "b.png")], "a.png is no folder"),
                         ([*runs, "-o", "b.png", "--width", "0"], "--width is 0; it must be at least 1")):
         assert compare_runs.main(given) == 1
         text = capsys.readouterr().err
