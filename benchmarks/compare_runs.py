@@ -15,7 +15,7 @@ from typing import Optional, Sequence
 import torch
 from PIL import Image
 
-from dsmoe.errors import TrainerError, in_one_line
+from dsmoe.errors import TrainerError, in_one_line, report
 from dsmoe.inspection import open_run, to_image
 from dsmoe.options.config import TrainConfig
 from dsmoe.results.metrics import psnr, quantised
@@ -35,11 +35,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     try:
         compare(parser.parse_args(argv))
     except Exception as error:
-        text = in_one_line(error)
-        if text is None:
-            raise
-        print(f"{parser.prog}: error: {text}", file=sys.stderr)
-        return 1
+        return report(parser.prog, error, in_one_line(error))
     return 0
 
 

@@ -10,7 +10,7 @@ import sys
 from typing import TYPE_CHECKING, Any, Dict, List, Optional, Tuple
 
 from .arguments import build_parser, completion_script
-from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable
+from .errors import TrainerError, in_one_line, is_lost, print_any_name, printable, report
 from .options.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from .options.config_arguments import config_from_arguments, given_options, take_paper
 from .options.early import check_early
@@ -59,10 +59,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     except Exception as error:
         of_patch = isinstance(error, PatchError)  # which lists reasons line by line
         text = "\n".join(map(printable, str(error).split("\n"))) if of_patch else in_one_line(error)
-        if text is None:
-            raise
-        print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
-        return 1
+        return report(f"dsmoe {arguments.command}", error, text)
     except KeyboardInterrupt as stop:
         trains = arguments.command in ("train", "simplify")
         continues = trains and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))

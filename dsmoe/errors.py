@@ -50,6 +50,17 @@ def in_one_line(error: BaseException) -> Optional[str]:
     return out_of_memory(error)
 
 
+def report(program: str, error: Exception, text: Optional[str]) -> int:
+    """Prints what a program says of an error in place of a traceback; returns its exit status.
+
+    Raises the error if the text is None, as of `in_one_line`.
+    """
+    if text is None:
+        raise error
+    print(f"{program}: error: {text}", file=sys.stderr)
+    return 1
+
+
 def out_of_memory(error: BaseException) -> Optional[str]:
     """Whose memory did not suffice, and for how much; None if the error is another one."""
     text = str(error)

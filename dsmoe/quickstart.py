@@ -13,7 +13,7 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from .errors import in_one_line, print_any_name
+from .errors import in_one_line, print_any_name, report
 from .inspection import open_renderer, to_image
 from .options.config import IMAGES, TrainConfig, flags_text
 from .options.presets import FAST, STRATEGY, chosen_for_scene, with_preset
@@ -54,11 +54,7 @@ def main(argv: Optional[List[str]] = None) -> int:
         run(arguments)
         return 0
     except Exception as error:
-        text = in_one_line(error)
-        if text is None:
-            raise
-        print(f"quickstart: error: {text}", file=sys.stderr)
-        return 1
+        return report("quickstart", error, in_one_line(error))
     except KeyboardInterrupt as stop:
         print("\nquickstart: interrupted", file=sys.stderr)
         return exit_status(stop)

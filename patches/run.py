@@ -229,7 +229,7 @@ def _script(words: Sequence[str]) -> Optional[Path]:
 def _missing_script(words: Sequence[str]) -> str:
     """Returns the script that a command of Python names and that is not there, else ""."""
     options = list(itertools.takewhile(lambda word: word.startswith("-"), words[1:]))
-    script = "".join(words[1 + len(options):][:1])
+    script = next(iter(words[1 + len(options):]), "")
     runs_other = any(word == "-" or word.startswith(("-c", "-m")) for word in options)  # what is typed, code, a module
     is_script = re.fullmatch(r"python[\d.]*", Path(words[0]).name) and script.endswith(".py") and not runs_other
     return script if is_script and not Path(script).exists() else ""

@@ -9,7 +9,7 @@ import shutil
 import sys
 from typing import Any, Dict, List, Optional, Tuple
 
-from ..errors import TrainerError, print_any_name
+from ..errors import TrainerError, print_any_name, report
 from ..system.files import check_place
 from ..system.output_folder import own_record, read_record
 from .choices import asked_device
@@ -132,8 +132,7 @@ def check(argv: Optional[List[str]] = None) -> int:
         earlier_files(output, subject, arguments.overwrite)
         check_place(output, is_one_file=False)
     except TrainerError as error:
-        print(f"quickstart: error: {error}", file=sys.stderr)
-        return 1
+        return report("quickstart", error, str(error))
     return 0
 
 

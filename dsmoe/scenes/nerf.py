@@ -215,9 +215,10 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
     mask = frame.get("mask_path")
     if mask is None or not is_there:
         return PosedImage(camera, image_path, lens=lens)
-    if not isinstance(mask, str) or not is_file(_below(folder, mask)):
+    mask_path = _below(folder, mask) if isinstance(mask, str) else None
+    if mask_path is None or not is_file(mask_path):
         raise SceneError(f"{where}: `mask_path` is {reprlib.repr(mask)}: no such file")
-    return PosedImage(camera, image_path, _below(folder, mask), lens)
+    return PosedImage(camera, image_path, mask_path, lens)
 
 
 def _lens(model: Any, is_fisheye: bool, coefficients: Dict[str, float], where: str) -> Optional[Lens]:
